@@ -1,0 +1,38 @@
+"""Prints the tables, as Markdown."""
+
+import sys
+
+from benchmarks import in_process, memory, over_zenoh
+
+TABLES = {
+    "over_zenoh": (
+        "Attempted double step over Zenoh, two slave processes on loopback",
+        ("configuration", "attempted double step", "empty two-slave fan-out", "ratio"),
+        over_zenoh.run,
+    ),
+    "in_process": (
+        "Attempted double step in process",
+        ("configuration", "attempted double step", "by hand with FMPy", "ratio"),
+        in_process.run,
+    ),
+    "memory": (
+        "Resident memory over a million attempted double steps",
+        ("process", "after 10 %", "at the end", "growth"),
+        memory.run,
+    ),
+}
+
+
+def main(names: list[str]) -> None:
+    """Run the named benchmarks, or all."""
+    for name in names or TABLES:
+        title, columns, run = TABLES[name]
+        print(f"\n### {title}\n")
+        print(f"| {' | '.join(columns)} |")
+        print("|" + "---|" * len(columns))
+        for row in run():
+            print(f"| {' | '.join(row)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,69 @@
+"""An attempted double step over Zenoh against an empty fan-out to two processes."""
+
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+from benchmarks.interleaved import Interleaved
+from benchmarks.quarter_car import system
+from master_node.co_simulation import CoSimulation
+from master_node.slave_group import SlaveGroup
+from master_node.slaves import slaves_on_bus
+from master_node.system import resolve
+from protocol.zenoh_bus import Endpoints, ZenohBus
+
+
+def run() -> list[tuple[str, str, str, str]]:
+    """Rows: configuration, median attempt, median empty fan-out, ratio."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    bus = ZenohBus(Endpoints(listen=(endpoint,)))
+    alive = threading.Semaphore(0)
+    bus.watch("echo/*/alive", lambda _, up: alive.release() if up else None)
+    echoes = [
+        subprocess.Popen([sys.executable, "-m", "benchmarks.echo", endpoint, f"echo/{i}"])
+        for i in range(2)
+    ]
+    try:
+        for _ in echoes:
+            alive.acquire(timeout=30.0)
+        callers = [bus.caller(f"echo/{i}", 5.0) for i in range(2)]
+
+        def fan_out() -> None:
+            for pending in [caller.send(b"") for caller in callers]:
+                pending.result()
+
+        rows = []
+        for estimator, order in (("mod", 1), ("rich", 1), ("mod", 3), ("rich", 3)):
+            rows.append(_measure(fan_out, estimator, order))
+        return rows
+    finally:
+        for echo in echoes:
+            echo.terminate()
+            echo.wait(5.0)
+        bus.close()
+
+
+def _measure(fan_out: object, estimator: str, order: int) -> tuple[str, str, str, str]:
+    assert callable(fan_out)
+    car = system(estimator=estimator, order=order, stop_time=30.0)
+    timing = Interleaved(fan_out)
+    with (
+        tempfile.TemporaryDirectory() as logs,
+        slaves_on_bus(car, Path(logs)) as slaves,
+    ):
+        coupled = resolve(car, slaves.descriptions)
+        statistics = CoSimulation(SlaveGroup(slaves.links), coupled, car, timing).run()
+    attempts = statistics.communication_steps // 2 + statistics.rejected_double_steps
+    requests = {s.requests / attempts for s in statistics.slaves.values()}
+    attempt, empty = timing.medians()
+    return (
+        f"EST_{estimator}, k = {order} ({'/'.join(f'{r:g}' for r in requests)} requests a slave)",
+        f"{attempt:.0f} us",
+        f"{empty:.0f} us",
+        f"{attempt / empty:.2f}",
+    )

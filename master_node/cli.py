@@ -1,0 +1,161 @@
+"""The ``master-node`` command."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, NoReturn
+
+import typer
+
+from protocol.errors import DoublestepError, InterruptedRunError
+
+app = typer.Typer(
+    help="Co-simulation master with error-controlled communication step sizes.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
+
+
+@app.command()
+def run(
+    system_file: Annotated[Path, typer.Argument(metavar="SYSTEM.toml", help="What to run.")],
+    output: Annotated[Path, typer.Option(help="Directory for the results.")] = Path("results"),
+    order: Annotated[
+        int | None, typer.Option(min=0, max=3, help="Degree k of the input polynomials.")
+    ] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="rich, mod, or none for a fixed step.")
+    ] = None,
+    relative_tolerance: Annotated[float | None, typer.Option(help="RTOL of all outputs.")] = None,
+    absolute_tolerance: Annotated[float | None, typer.Option(help="ATOL of all outputs.")] = None,
+    start_time: Annotated[float | None, typer.Option(help="[s]")] = None,
+    stop_time: Annotated[float | None, typer.Option(help="[s]")] = None,
+    step_size: Annotated[
+        float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
+    ] = None,
+    in_process: Annotated[
+        bool, typer.Option("--in-process", help="Run the slaves in this process, without a bus.")
+    ] = False,
+    no_launch: Annotated[
+        bool, typer.Option("--no-launch", help="Start no slaves: find all of them on the bus.")
+    ] = False,
+    connect: Annotated[
+        list[str] | None, typer.Option(help="Router or slave to connect to, tcp/HOST:PORT.")
+    ] = None,
+    listen: Annotated[
+        list[str] | None, typer.Option(help="Where slaves can connect, tcp/HOST:PORT.")
+    ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
+    ] = False,
+    timeout: Annotated[
+        float | None, typer.Option(help="How long to wait for slaves to appear [s].")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
+) -> None:
+    """Run the system of SYSTEM.toml and write results.csv, steps.csv, summary.json and results.png."""
+    from rich.console import Console  # noqa: PLC0415  each command imports what it needs
+
+    from master_node.configuration import load_system  # noqa: PLC0415
+    from master_node.plots import plot_result  # noqa: PLC0415
+    from master_node.progress import ProgressBar, summary_table  # noqa: PLC0415
+    from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
+    from master_node.simulation import run as run_system  # noqa: PLC0415
+
+    signal.signal(signal.SIGTERM, _interrupt)
+    system = (
+        load_system(system_file)
+        .with_simulation(
+            order=order,
+            estimator=estimator,
+            relative_tolerance=relative_tolerance,
+            absolute_tolerance=absolute_tolerance,
+            start_time=start_time,
+            stop_time=stop_time,
+            initial_step_size=step_size,
+        )
+        .with_bus(
+            connect=tuple(connect or ()),
+            listen=tuple(listen or ()),
+            insecure=insecure,
+            discovery_timeout=timeout,
+        )
+    )
+    try:
+        run_system(
+            system,
+            output,
+            in_process=in_process,
+            launch=not no_launch,
+            observers=(ProgressBar(quiet=quiet),),
+        )
+    except KeyboardInterrupt:
+        raise InterruptedRunError("interrupted before the first step") from None
+    result = Result.load(output)
+    if not no_plot:
+        plot_result(result, output / PLOT_FILE, show=False, variables=None)
+    if not quiet:
+        console = Console()
+        console.print(summary_table(result.summary))
+        console.print(f"results in {output}", highlight=False)
+
+
+@app.command()
+def plot(
+    directory: ResultDirectory,
+    variable: Annotated[
+        list[str] | None, typer.Option(help="slave.variable to draw; may be repeated.")
+    ] = None,
+    show: Annotated[bool, typer.Option("--show", help="Open a window.")] = False,
+    file: Annotated[
+        Path | None, typer.Option(help="Picture to write [default: DIRECTORY/results.png].")
+    ] = None,
+) -> None:
+    """Draw the results in DIRECTORY again."""
+    from master_node.plots import plot_result  # noqa: PLC0415
+    from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
+
+    path = file or directory / PLOT_FILE
+    plot_result(Result.load(directory), path, show=show, variables=variable or None)
+    typer.echo(path)
+
+
+@app.command()
+def compare(
+    a: ResultDirectory,
+    b: ResultDirectory,
+    rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = 1e-3,
+    atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = 1e-6,
+) -> None:
+    """Compare two result directories, |A - B| <= atol + rtol |B|; exit code 1 when they differ."""
+    from rich.console import Console  # noqa: PLC0415
+
+    from master_node.compare import compare as compare_results  # noqa: PLC0415
+
+    comparison = compare_results(a, b, rtol, atol)
+    Console().print(comparison.table())
+    if not comparison.within_tolerance:
+        raise typer.Exit(1)
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
+    """SIGTERM ends a run as Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Entry point: errors become one line and an exit code."""
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s", stream=sys.stderr)
+    try:
+        app()
+    except DoublestepError as error:
+        typer.echo(f"master-node: {error}", err=True)
+        sys.exit(error.exit_code)

@@ -1,0 +1,340 @@
+"""System files: TOML into frozen, validated values, before anything starts.
+
+Every message names file, table and key. ``docs/system-file.md`` explains each key to a user.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    StrictBool,
+    StrictFloat,
+    StrictInt,
+    StrictStr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import ErrorDetails
+
+from protocol.errors import ConfigurationError
+from protocol.keys import check_name
+from protocol.names import nearest
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be finite")
+    return value
+
+
+Number = Annotated[StrictFloat, AfterValidator(_finite)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Value = StrictBool | StrictInt | StrictFloat | StrictStr
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SimulationSettings(_Table):
+    """The ``[simulation]`` table.
+
+    Attributes:
+        start_time, stop_time: [s].
+        initial_step_size: H_0 [s]; default: a thousandth of the simulated time. With estimator
+            ``none`` it is the step size of the whole run.
+        order: degree k of the input polynomials.
+        estimator: EST_Rich, EST_mod or none (a fixed step).
+        relative_tolerance, absolute_tolerance: RTOL and ATOL of equation (8) for all outputs;
+            ATOL counts in units of a variable's nominal value.
+        slave_tolerance: relative tolerance for the slaves' own solvers; default 0.01 RTOL.
+        alpha, theta_min, theta_max: of the step size controller (the paper, section 3).
+        smallest_step_size, largest_step_size: bounds of H [s]; defaults: 1e-9 of the simulated
+            time, and half of it.
+        initial_history: ``rest``: the system rested before the start, so order k is used from
+            the first step; ``none``: the order grows as communication points come in.
+    """
+
+    start_time: Number = 0.0
+    stop_time: Number | None = None
+    initial_step_size: Positive | None = None
+    order: Literal[0, 1, 2, 3] = 1
+    estimator: Literal["rich", "mod", "none"] = "mod"
+    relative_tolerance: NotNegative = 1e-4
+    absolute_tolerance: Positive = 1e-4
+    slave_tolerance: Positive | None = None
+    alpha: Annotated[Number, Field(gt=0, lt=1)] = 0.85
+    theta_min: Annotated[Number, Field(gt=0, lt=1)] = 0.3
+    theta_max: Annotated[Number, Field(gt=1)] = 2.0
+    smallest_step_size: Positive | None = None
+    largest_step_size: Positive | None = None
+    initial_history: Literal["rest", "none"] = "rest"
+
+    @field_validator("order", mode="before")
+    @classmethod
+    def _whole_order(cls, value: Any) -> Any:
+        if isinstance(value, bool):
+            raise ValueError("must be 0, 1, 2 or 3")  # noqa: TRY004  pydantic wants ValueError
+        return value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.stop_time is None:
+            return self
+        duration = self.stop_time - self.start_time
+        if duration <= 0:
+            raise ValueError(
+                f"stop_time {self.stop_time:g} must be after start_time {self.start_time:g}"
+            )
+        smallest, initial, largest = self.smallest, self.step_size, self.largest
+        if not smallest <= initial:
+            raise ValueError(
+                f"initial_step_size {initial:g} is below smallest_step_size {smallest:g}"
+            )
+        if self.largest_step_size is not None and initial > largest:
+            raise ValueError(
+                f"initial_step_size {initial:g} is above largest_step_size {largest:g}"
+            )
+        return self
+
+    @property
+    def end(self) -> float:
+        """The stop time [s].
+
+        Raises:
+            ConfigurationError: it is not given.
+        """
+        if self.stop_time is None:
+            raise ConfigurationError(
+                "[simulation] stop_time is missing", remedy="give it in the file or --stop-time"
+            )
+        return float(self.stop_time)
+
+    @property
+    def step_size(self) -> float:
+        """H_0 [s]."""
+        return float(self.initial_step_size or (self.end - self.start_time) * 1e-3)
+
+    @property
+    def smallest(self) -> float:
+        """Smallest communication step size [s]."""
+        return float(
+            self.smallest_step_size or min((self.end - self.start_time) * 1e-9, self.step_size)
+        )
+
+    @property
+    def largest(self) -> float:
+        """Largest communication step size [s]."""
+        return float(self.largest_step_size or (self.end - self.start_time) / 2)
+
+    @property
+    def slave_relative_tolerance(self) -> float | None:
+        """For the slaves' own solvers; None leaves them their default."""
+        if self.slave_tolerance is not None:
+            return float(self.slave_tolerance)
+        return 0.01 * self.relative_tolerance if self.relative_tolerance else None
+
+
+class OutputTolerance(_Table):
+    """Tolerances of one output; what is not given comes from the slave or the simulation."""
+
+    relative: NotNegative | None = None
+    absolute: Positive | None = None
+
+
+class SlaveSettings(_Table):
+    """A ``[slaves.NAME]`` table.
+
+    Attributes:
+        model: an ``.fmu`` file, ``package.module:Class`` or ``file.py:Class``, relative to the
+            system file; without it the slave is looked for on the bus, by name.
+        parameters: start values of parameters and other variables, by name.
+        relative_tolerance, absolute_tolerance: for this slave's outputs.
+        tolerances: for single outputs, by name.
+    """
+
+    model: StrictStr | None = None
+    parameters: Mapping[str, Value] = Field(default_factory=dict)
+    relative_tolerance: NotNegative | None = None
+    absolute_tolerance: Positive | None = None
+    tolerances: Mapping[str, OutputTolerance] = Field(default_factory=dict)
+
+
+class Connection(_Table):
+    """A ``[[connections]]`` table: ``from = "slave.output"``, ``to = "slave.input"``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    source: StrictStr = Field(alias="from")
+    target: StrictStr = Field(alias="to")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_pair(cls, value: Any) -> Any:
+        if isinstance(value, tuple) and len(value) == 2:
+            return {"from": value[0], "to": value[1]}
+        return value
+
+
+class BusSettings(_Table):
+    """The ``[bus]`` table.
+
+    Attributes:
+        listen: where slaves that are not started by this master can connect to; default: the
+            loopback port 7447 when there are such slaves and nothing to connect to.
+        connect: routers or slaves to connect to.
+        insecure: allow addresses other than loopback.
+        discovery_timeout: how long to wait for slaves to appear [s].
+        step_timeout: how long one request may take [s].
+    """
+
+    listen: tuple[StrictStr, ...] = ()
+    connect: tuple[StrictStr, ...] = ()
+    insecure: StrictBool = False
+    discovery_timeout: Positive = 30.0
+    step_timeout: Positive = 60.0
+
+
+class System(_Table):
+    """A whole system: what a system file holds.
+
+    Attributes:
+        base: directory to which the models' paths are relative.
+        source: what to call this in messages: the file's name.
+    """
+
+    simulation: SimulationSettings = SimulationSettings()
+    slaves: Mapping[str, SlaveSettings]
+    connections: tuple[Connection, ...] = ()
+    bus: BusSettings = BusSettings()
+    base: Path = Field(default_factory=Path.cwd, exclude=True)
+    source: str = Field(default="the system", exclude=True)
+
+    def __init__(self, **tables: Any) -> None:
+        try:
+            super().__init__(**tables)
+        except ValidationError as error:
+            raise _configuration_error(str(tables.get("source", "the system")), error) from None
+
+    @model_validator(mode="after")
+    def _names(self) -> Self:
+        if not self.slaves:
+            raise ValueError("at least one [slaves.NAME] table is needed")
+        for name in self.slaves:
+            try:
+                check_name(name)
+            except ConfigurationError as error:
+                raise ValueError(str(error)) from None
+        return self
+
+    def with_simulation(self, **settings: Any) -> System:
+        """The same system with other simulation settings; None leaves one as it is."""
+        given = {name: value for name, value in settings.items() if value is not None}
+        simulation = self.simulation.model_dump(exclude_unset=True) | given
+        return self._with(simulation=simulation)
+
+    def with_bus(self, **settings: Any) -> System:
+        """The same system with other bus settings; None and empty ones leave one as it is."""
+        given = {name: value for name, value in settings.items() if value not in (None, (), False)}
+        return self._with(bus=self.bus.model_dump(exclude_unset=True) | given)
+
+    def _with(self, **tables: Any) -> System:
+        kept = {"simulation", "slaves", "connections", "bus"} - tables.keys()
+        return System(
+            **{name: getattr(self, name) for name in kept},
+            **tables,
+            base=self.base,
+            source=self.source,
+        )
+
+
+def load_system(path: Path) -> System:
+    """Read a system file.
+
+    Raises:
+        ConfigurationError: it is missing or wrong; the message has a line for each mistake.
+    """
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: not a TOML file: {error}") from error
+    for reserved in ("base", "source"):
+        if reserved in tables:
+            raise ConfigurationError(f"{path}: {reserved}: unknown table or key")
+    return System(**tables, base=path.absolute().parent, source=str(path))
+
+
+def _configuration_error(source: str, error: ValidationError) -> ConfigurationError:
+    sentences: dict[tuple[str, ...], str] = {}
+    for detail in error.errors():
+        sentences.setdefault(_place(detail), _sentence(detail))  # one for each union's branches
+    return ConfigurationError("\n".join(f"{source}: {text}" for text in sentences.values()))
+
+
+def _place(detail: ErrorDetails) -> tuple[str, ...]:
+    return tuple(str(part) for part in detail["loc"] if part not in _UNION_BRANCHES)
+
+
+def _sentence(detail: ErrorDetails) -> str:
+    """One mistake in the words of the file's author."""
+    place = list(_place(detail))
+    kind = detail["type"]
+    if kind == "extra_forbidden":
+        *tables, key = place
+        return f"{_table(tables)}unknown key {key!r}{nearest(key, _known_keys(tables))}"
+    if kind == "missing":
+        *tables, key = place
+        return f"{_table(tables)}key {key!r} is missing"
+    message = detail["msg"].removeprefix("Value error, ")
+    message = message[:1].lower() + message[1:]
+    if len(place) > 2 and place[2] == "parameters":
+        message = "must be a number, a boolean or a string"
+    if not place:
+        return message
+    if kind == "value_error" and len(place) == 1:
+        return f"[{place[0]}] {message}"
+    *tables, key = place
+    return f"{_table(tables)}{key} = {detail['input']!r:.60}: {message}"
+
+
+_UNION_BRANCHES = frozenset({"float", "int", "bool", "str", "constrained-float", "constrained-int"})
+
+
+def _table(place: list[str]) -> str:
+    if not place:
+        return ""
+    if place[0] == "connections":
+        number = f" number {int(place[1]) + 1}" if len(place) > 1 else ""
+        return f"[[connections]]{number}: "
+    return f"[{'.'.join(place)}] "
+
+
+def _known_keys(place: list[str]) -> list[str]:
+    model: type[BaseModel] = System
+    match place:
+        case ["simulation"]:
+            model = SimulationSettings
+        case ["bus"]:
+            model = BusSettings
+        case ["slaves", _]:
+            model = SlaveSettings
+        case ["slaves", _, "tolerances", _]:
+            model = OutputTolerance
+        case ["connections", _]:
+            return ["from", "to"]
+    return [name for name in model.model_fields if name not in ("base", "source")]

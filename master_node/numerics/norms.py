@@ -1,0 +1,37 @@
+"""The error indicator ERR (the paper, equation (8))."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+
+from protocol.signals import FloatArray
+
+
+def weighted_rms_norm(
+    error: FloatArray,
+    y: FloatArray,
+    absolute_tolerance: FloatArray,
+    relative_tolerance: FloatArray,
+) -> tuple[float, int]:
+    """ERR = sqrt( mean_j ( EST_j / (ATOL_j + RTOL_j |y_j|) )^2 ), and which j has most of it.
+
+    Args:
+        error: EST, shape (m,), unit [y], m >= 1.
+        y: outputs at the end of the double step, shape (m,).
+        absolute_tolerance: ATOL_j, shape (m,), unit [y].
+        relative_tolerance: RTOL_j, shape (m,).
+
+    Returns:
+        ERR and the index j of the largest part. Anything that is not finite in ``error`` or ``y``
+        gives infinity and the index of such a value: NaN never passes.
+    """
+    weighted = error / (absolute_tolerance + relative_tolerance * np.abs(y))
+    square = float(weighted @ weighted)
+    if square < np.inf:  # false for NaN too
+        return sqrt(square / len(weighted)), int(np.argmax(np.abs(weighted)))
+    bad = ~(np.isfinite(weighted) & np.isfinite(y))
+    if bad.any():
+        return np.inf, int(np.argmax(bad))
+    return np.inf, int(np.argmax(np.abs(weighted)))

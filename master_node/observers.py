@@ -1,0 +1,155 @@
+"""What a run tells those who watch it: results, progress, in-memory recording.
+
+The algorithm calls observers between steps and never reads anything back from them. An observer
+that raises ends the run with that error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol
+
+from protocol.signals import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class RunStart:
+    """What is known before the first step.
+
+    Attributes:
+        output_names: ``slave.variable`` of the m outputs, in the order of all output arrays.
+        output_units: their units, "" where none.
+        start_time, stop_time: [s].
+        outputs: y(T_0), shape (m,).
+    """
+
+    output_names: tuple[str, ...]
+    output_units: tuple[str, ...]
+    start_time: float
+    stop_time: float
+    outputs: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One attempted double step (or one single step when there is no estimator).
+
+    Attributes:
+        time: communication point T_n from which it started [s].
+        step_size: communication step size H [s], the small one.
+        order: degree k of the input polynomials.
+        error_norm: ERR of equation (8); NaN when the step gave none, inf when a value was not
+            finite.
+        accepted: whether the solution moved on.
+        limiting_variable: ``slave.variable`` with the largest part in ERR, or a reason why there
+            is no ERR; "" when there is no estimator.
+        points: the communication points reached and y there, shape (m,) each; empty when
+            rejected.
+    """
+
+    time: float
+    step_size: float
+    order: int
+    error_norm: float
+    accepted: bool
+    limiting_variable: str
+    points: tuple[tuple[float, FloatArray], ...] = ()
+
+
+class Outcome(StrEnum):
+    """How a run ended."""
+
+    COMPLETED = "completed"
+    TERMINATED = "terminated by a slave"
+    INTERRUPTED = "interrupted"
+    FAILED = "failed"
+
+
+@dataclass(slots=True)
+class SlaveStatistics:
+    """Counters of one slave over a run; times in seconds."""
+
+    do_steps: int = 0
+    rollbacks: int = 0
+    requests: int = 0
+    compute_time: float = 0.0
+
+
+@dataclass(slots=True)
+class Statistics:
+    """Counters of a run.
+
+    Attributes:
+        communication_steps: accepted small steps.
+        rejected_double_steps: attempts that were not accepted.
+        round_trips: rounds of requests to all slaves between the first and the last step.
+        wait_time: seconds in which the master waited for the slaves.
+        wall_time: seconds of the whole stepping phase.
+        time: the last accepted communication point [s].
+        smallest_step_size, largest_step_size: over accepted steps [s]; NaN before the first.
+    """
+
+    communication_steps: int = 0
+    rejected_double_steps: int = 0
+    round_trips: int = 0
+    wait_time: float = 0.0
+    wall_time: float = 0.0
+    time: float = 0.0
+    smallest_step_size: float = float("nan")
+    largest_step_size: float = float("nan")
+    slaves: dict[str, SlaveStatistics] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class RunEnd:
+    """How it went. ``message`` is the error's or the slave's text, "" when completed."""
+
+    outcome: Outcome
+    statistics: Statistics
+    message: str = ""
+
+
+class Observer(Protocol):
+    """Gets told; see the module's docstring."""
+
+    def started(self, start: RunStart) -> None:
+        """Called once, when the outputs at T_0 are known."""
+        ...
+
+    def attempted(self, attempt: Attempt) -> None:
+        """Called after every attempt, accepted or not."""
+        ...
+
+    def ended(self, end: RunEnd) -> None:
+        """Called once if ``started`` was, whatever happened."""
+        ...
+
+
+class Observers:
+    """Several observers as one, told in order; all of them hear the end."""
+
+    def __init__(self, observers: Sequence[Observer]) -> None:
+        self._observers = tuple(observers)
+
+    def started(self, start: RunStart) -> None:
+        """Pass on."""
+        for observer in self._observers:
+            observer.started(start)
+
+    def attempted(self, attempt: Attempt) -> None:
+        """Pass on."""
+        for observer in self._observers:
+            observer.attempted(attempt)
+
+    def ended(self, end: RunEnd) -> None:
+        """Pass on to all; the first error is raised after everyone was told."""
+        errors = []
+        for observer in self._observers:
+            try:
+                observer.ended(end)
+            except Exception as error:  # every observer must get to close its files
+                errors.append(error)
+        if errors:
+            raise errors[0]

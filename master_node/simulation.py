@@ -1,0 +1,117 @@
+"""Puts a run together: slaves, connections, observers, algorithm. Used by the command and `simulate`."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from master_node.co_simulation import CoSimulation, check_capabilities
+from master_node.configuration import System
+from master_node.observers import Observer, Observers
+from master_node.results import Recording, Result, ResultsWriter
+from master_node.slave_group import SlaveGroup
+from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
+from master_node.system import resolve
+from protocol.slave import SlaveDescription
+
+log = logging.getLogger("master_node")
+
+
+def simulate(
+    system: System,
+    *,
+    output: Path | str | None = None,
+    in_process: bool = False,
+    launch: bool = True,
+    observers: Sequence[Observer] = (),
+    **simulation: Any,
+) -> Result:
+    """Run a system and give its result.
+
+    Args:
+        system: slaves, connections and settings.
+        output: directory for the result files; None: none are written.
+        in_process: run the slaves in this process, without a bus.
+        launch: start slaves that have a model; False: find all of them on the bus.
+        observers: are told of everything that happens.
+        **simulation: settings that override ``system.simulation``, such as ``stop_time=4.0``.
+
+    Raises:
+        DoublestepError: see ``protocol/errors.py``; the result files hold what was accepted.
+    """
+    system = system.with_simulation(**simulation)
+    recording = Recording(settings_of(system, {}))
+    directory = None if output is None else Path(output)
+    run(
+        system,
+        directory,
+        in_process=in_process,
+        launch=launch,
+        observers=(recording, *observers),
+    )
+    return recording.result()
+
+
+def run(
+    system: System,
+    directory: Path | None,
+    *,
+    in_process: bool = False,
+    launch: bool = True,
+    observers: Sequence[Observer] = (),
+) -> None:
+    """Run a system, streaming into ``directory`` if one is given; raises as `simulate`."""
+    settings = settings_of(system, {})
+    writer = None if directory is None else ResultsWriter(directory, settings)
+    if writer is not None:
+        writer.prepare()
+    with _slaves(system, directory, in_process=in_process, launch=launch) as slaves:
+        coupled = resolve(system, slaves.descriptions)
+        for warning in check_capabilities(coupled, system.simulation):
+            log.warning("%s", warning)
+        if directory is not None:
+            writer = ResultsWriter(directory, settings_of(system, slaves.descriptions))
+        observer = Observers([*observers, writer] if writer is not None else observers)
+        CoSimulation(SlaveGroup(slaves.links), coupled, system, observer).run()
+
+
+@contextmanager
+def _slaves(
+    system: System, directory: Path | None, *, in_process: bool, launch: bool
+) -> Iterator[Slaves]:
+    if in_process:
+        with slaves_in_process(system) as slaves:
+            yield slaves
+        return
+    with tempfile.TemporaryDirectory(prefix="doublestep-") as temporary:
+        logs = Path(temporary) if directory is None else directory / "logs"
+        logs.mkdir(exist_ok=True)
+        with slaves_on_bus(system, logs, launch=launch) as slaves:
+            yield slaves
+
+
+def settings_of(system: System, descriptions: Mapping[str, SlaveDescription]) -> dict[str, object]:
+    """All settings of a run as plain data, with the hashes of the models, for ``summary.json``."""
+    settings = system.model_dump(mode="json", by_alias=True)
+    simulation = system.simulation
+    settings["simulation"] |= {
+        "initial_step_size": simulation.step_size,
+        "smallest_step_size": simulation.smallest,
+        "largest_step_size": simulation.largest,
+        "slave_tolerance": simulation.slave_relative_tolerance,
+    }
+    settings["system_file"] = system.source
+    settings["models"] = {
+        name: {
+            "model": description.model,
+            "kind": description.kind,
+            "sha256": description.sha256,
+            "state_kind": description.state_kind,
+        }
+        for name, description in descriptions.items()
+    }
+    return settings

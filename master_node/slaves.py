@@ -1,0 +1,243 @@
+"""From the system's slaves to links: launched here, found on the bus, or in this process.
+
+Each way is a context manager that gives a `Slaves` and leaves nothing running behind it.
+"""
+
+from __future__ import annotations
+
+import socket
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from secrets import token_hex
+from time import monotonic
+
+from master_node.configuration import DEFAULT_ENDPOINT, System
+from master_node.launcher import Launcher
+from master_node.remote_slave import RemoteSlave, slave_status
+from master_node.slave_link import LocalSlave, SlaveLink
+from protocol.bus import Bus
+from protocol.calls import Describe
+from protocol.errors import ConfigurationError, DoublestepError, ProtocolError, SlaveLostError
+from protocol.keys import SlaveKey, alive_master, alive_slaves
+from protocol.slave import SlaveDescription
+from protocol.zenoh_bus import Endpoints, ZenohBus
+
+_POLL_TIME = 0.02
+_DEATH_TIME = 1.0
+_LIVELINESS_TIME = 1.0
+
+
+@dataclass(frozen=True)
+class Slaves:
+    """The slaves of a run, instantiated, in the order of the system file.
+
+    Attributes:
+        links: to each of them.
+        descriptions: what each said of itself.
+        launcher: of those started here, None in process.
+    """
+
+    links: Mapping[str, SlaveLink]
+    descriptions: Mapping[str, SlaveDescription]
+    launcher: Launcher | None = None
+
+    def explain(self, error: DoublestepError) -> DoublestepError:
+        """A lost slave's error with the exit code and last words of its process, if it is ours."""
+        if self.launcher is None or not isinstance(error, SlaveLostError):
+            return error
+        ended = self.launcher.wait_ended(error.slave, _DEATH_TIME)
+        if ended is None:
+            return error
+        return SlaveLostError(ended.cause, remedy=ended.remedy).located(
+            slave=error.slave, phase=error.phase, time=error.time, step_size=error.step_size
+        )
+
+
+@contextmanager
+def slaves_in_process(system: System) -> Iterator[Slaves]:
+    """All slaves in this process, without a bus.
+
+    Raises:
+        ConfigurationError: a slave has no model, or its model cannot be loaded.
+    """
+    load = entry_points(group="doublestep.in_process")["slave"].load()
+    with ExitStack() as stack:
+        links: dict[str, SlaveLink] = {}
+        descriptions = {}
+        for name, settings in system.slaves.items():
+            if settings.model is None:
+                raise ConfigurationError(
+                    f"{system.source}: [slaves.{name}] has no model, so it cannot run in process"
+                )
+            scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="doublestep-"))
+            try:
+                executor = load(settings.model, system.base, name, Path(scratch))
+            except DoublestepError as error:
+                raise error.located(slave=name) from None
+            stack.callback(executor.close)
+            links[name] = LocalSlave(executor)
+            descriptions[name] = executor.description
+        yield Slaves(links, descriptions)
+
+
+@contextmanager
+def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -> Iterator[Slaves]:
+    """Slaves over Zenoh: those with a model are started here, the others found by name.
+
+    Args:
+        system: what to run.
+        log_directory: existing; gets the launched slaves' logs.
+        launch: False: all slaves are expected on the bus.
+
+    Raises:
+        ConfigurationError: an address cannot be used, or a model cannot be loaded.
+        SlaveLostError: a slave did not appear in time; says what was found.
+        ProtocolError: two slaves of one name, or a slave held by another master.
+    """
+    launched = {n for n, s in system.slaves.items() if launch and s.model is not None}
+    found = [name for name in system.slaves if name not in launched]
+    private = f"tcp/127.0.0.1:{_free_port()}"
+    with ExitStack() as stack:
+        bus = ZenohBus(_endpoints(system, private, launched=bool(launched), found=bool(found)))
+        stack.callback(bus.close)
+        run = token_hex(4)
+        bus.announce(alive_master(run))
+        launcher = Launcher(private, log_directory)
+        stack.callback(launcher.stop)
+        keys = {
+            name: launcher.launch(name, str(system.slaves[name].model), system.base)
+            for name in system.slaves
+            if name in launched
+        }
+        presence = _Presence(bus)
+        keys |= presence.wait(found, keys, launcher, system.bus.discovery_timeout)
+        links: dict[str, SlaveLink] = {}
+        remotes = {}
+        for name in system.slaves:
+            try:
+                remote = RemoteSlave(bus, keys[name], run, system.bus.step_timeout)
+            except DoublestepError as error:
+                raise error.located(slave=name, phase="claim") from None
+            links[name] = remotes[keys[name].alive] = remote
+            stack.callback(remote.release)
+        presence.on_loss(remotes)
+        slaves = Slaves(links, _describe(links), launcher)
+        try:
+            yield slaves
+        except DoublestepError as error:
+            raise slaves.explain(error) from error.__cause__
+        except KeyboardInterrupt:
+            launcher.stop(at_once=True)
+            raise
+
+
+def _describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
+    for link in links.values():
+        link.start([Describe()])
+    descriptions = {}
+    for name, link in links.items():
+        reply = link.finish()
+        if reply.error is not None:
+            raise reply.error.located(slave=name)
+        description = reply.results[0]
+        assert isinstance(description, SlaveDescription)
+        descriptions[name] = description
+    return descriptions
+
+
+def _endpoints(system: System, private: str, *, launched: bool, found: bool) -> Endpoints:
+    listen = list(system.bus.listen)
+    if found and not listen and not system.bus.connect:
+        listen.append(DEFAULT_ENDPOINT)
+    if launched:
+        listen.append(private)
+    return Endpoints(tuple(listen), tuple(system.bus.connect), system.bus.insecure)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class _Presence:
+    """Which slaves are on the bus, as their liveliness tokens come and go."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._changed = threading.Condition()
+        self._alive: set[SlaveKey] = set()
+        self._remotes: Mapping[str, RemoteSlave] = {}
+        bus.watch(alive_slaves(), self._told)
+
+    def _told(self, key: str, alive: bool) -> None:
+        slave = SlaveKey.from_alive(key)
+        if slave is None:
+            return
+        with self._changed:
+            (self._alive.add if alive else self._alive.discard)(slave)
+            self._changed.notify_all()
+        if not alive and key in self._remotes:
+            self._remotes[key].lost()
+
+    def on_loss(self, remotes: Mapping[str, RemoteSlave]) -> None:
+        """From now on tell these slaves' links when their token goes away."""
+        self._remotes = remotes
+
+    def wait(
+        self, names: list[str], keys: Mapping[str, SlaveKey], launcher: Launcher, timeout: float
+    ) -> dict[str, SlaveKey]:
+        """Wait until slaves called ``names`` and those at ``keys`` are alive.
+
+        Returns:
+            The keys of the slaves called ``names``.
+        """
+        deadline = monotonic() + timeout
+        while True:
+            launcher.check()
+            with self._changed:
+                alive = set(self._alive)
+                missing = [n for n in names if not any(k.name == n for k in alive)]
+                missing += [name for name, key in keys.items() if key not in alive]
+                if not missing:
+                    break
+                if monotonic() > deadline:
+                    raise self._not_found(missing, alive, timeout)
+                self._changed.wait(_POLL_TIME)
+        found = {}
+        for name in (*names, *keys):
+            tokens = self._bus.alive(alive_slaves(name), _LIVELINESS_TIME)
+            instances = [k for k in map(SlaveKey.from_alive, tokens) if k is not None]
+            if len(instances) > 1:
+                raise ProtocolError(
+                    f"{len(instances)} instances of {name!r}: "
+                    + ", ".join(self._whereabouts(k) for k in instances),
+                    slave=name,
+                    remedy="end all but one of them",
+                )
+            if name in names:
+                found[name] = instances[0]
+        return found
+
+    @staticmethod
+    def _not_found(missing: list[str], alive: set[SlaveKey], timeout: float) -> SlaveLostError:
+        there = ", ".join(sorted({k.name for k in alive})) or "no slave at all"
+        return SlaveLostError(
+            f"did not appear within {timeout:g} s; found on the bus: {there}",
+            slave=", ".join(missing),
+            phase="discovery",
+            remedy="start it with `slave-node serve MODEL --name NAME`, or check --connect "
+            "and --listen on both sides",
+        )
+
+    def _whereabouts(self, key: SlaveKey) -> str:
+        with suppress(DoublestepError):
+            status = slave_status(self._bus, key)
+            return f"{status.get('host')}/{status.get('pid')}"
+        return key.instance

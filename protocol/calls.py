@@ -1,0 +1,207 @@
+"""The vocabulary: FMI's verbs as frozen dataclasses, and the reply to a list of them.
+
+A request is a short program: a list of these calls that a slave executes in order. Saved states
+are named by the caller with small integers, so that a program can save a state and go back to it
+without a round trip in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+from protocol.signals import FloatArray
+
+if TYPE_CHECKING:
+    from protocol.errors import DoublestepError
+    from protocol.slave import StartValue, StepStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Describe:
+    """Ask for the `SlaveDescription`. Result: `SlaveDescription`."""
+
+    verb: ClassVar[str] = "describe"
+
+
+@dataclass(frozen=True, slots=True)
+class Initialize:
+    """fmi2SetupExperiment, start values, fmi2EnterInitializationMode. Result: None.
+
+    Attributes:
+        start_time: first communication point [s].
+        stop_time: last one [s], None if open.
+        relative_tolerance: for the slave's own solver, None for its default.
+        start_values: by variable name, parameters and others.
+        inputs: names of the inputs that the master will set, in the order of `SetInputs`.
+        outputs: names of the outputs that the master will read, in the order of `GetOutputs`.
+    """
+
+    verb: ClassVar[str] = "initialize"
+    start_time: float = 0.0
+    stop_time: float | None = None
+    relative_tolerance: float | None = None
+    start_values: Mapping[str, StartValue] = field(default_factory=dict)
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ExitInitializationMode:
+    """fmi2ExitInitializationMode. Result: None."""
+
+    verb: ClassVar[str] = "exit_initialization_mode"
+
+
+@dataclass(frozen=True, slots=True)
+class SetInputs:
+    """Input values and derivatives at the current communication point. Result: None.
+
+    Attributes:
+        derivatives: shape (k + 1, n_u), k in 0 to 3; row j is d^j u / dt^j, unit [u]/s^j.
+    """
+
+    verb: ClassVar[str] = "set_inputs"
+    derivatives: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class DoStep:
+    """fmi2DoStep. Result: `StepResult`. Anything but ``ok`` ends the program there.
+
+    Attributes:
+        communication_point: where the slave stands [s].
+        step_size: communication step size H [s].
+        no_set_state_prior: noSetFMUStatePriorToCurrentPoint: no state older than
+            ``communication_point`` will be restored any more.
+    """
+
+    verb: ClassVar[str] = "do_step"
+    communication_point: float
+    step_size: float
+    no_set_state_prior: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class GetOutputs:
+    """Outputs and their derivatives up to ``order``. Result: shape (order + 1, n_y)."""
+
+    verb: ClassVar[str] = "get_outputs"
+    order: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class GetState:
+    """fmi2GetFMUstate: save the state under the number ``state``. Result: None."""
+
+    verb: ClassVar[str] = "get_state"
+    state: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetState:
+    """fmi2SetFMUstate: go back to the saved state ``state``, which stays saved. Result: None."""
+
+    verb: ClassVar[str] = "set_state"
+    state: int
+
+
+@dataclass(frozen=True, slots=True)
+class FreeState:
+    """fmi2FreeFMUstate: give up the saved state ``state``. Result: None."""
+
+    verb: ClassVar[str] = "free_state"
+    state: int
+
+
+@dataclass(frozen=True, slots=True)
+class SerializeState:
+    """fmi2SerializeFMUstate of the saved state ``state``. Result: bytes."""
+
+    verb: ClassVar[str] = "serialize_state"
+    state: int
+
+
+@dataclass(frozen=True, slots=True)
+class DeserializeState:
+    """fmi2DeSerializeFMUstate: make ``data`` the saved state ``state``. Result: None."""
+
+    verb: ClassVar[str] = "deserialize_state"
+    state: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Terminate:
+    """fmi2Terminate. Result: None."""
+
+    verb: ClassVar[str] = "terminate"
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """fmi2Reset: back to the state after instantiation; saved states are freed. Result: None."""
+
+    verb: ClassVar[str] = "reset"
+
+
+Call = (
+    Describe
+    | Initialize
+    | ExitInitializationMode
+    | SetInputs
+    | DoStep
+    | GetOutputs
+    | GetState
+    | SetState
+    | FreeState
+    | SerializeState
+    | DeserializeState
+    | Terminate
+    | Reset
+)
+
+CALLS: tuple[type[Call], ...] = (
+    Describe,
+    Initialize,
+    ExitInitializationMode,
+    SetInputs,
+    DoStep,
+    GetOutputs,
+    GetState,
+    SetState,
+    FreeState,
+    SerializeState,
+    DeserializeState,
+    Terminate,
+    Reset,
+)
+
+
+class StepResult(NamedTuple):
+    """How a `DoStep` ended.
+
+    Attributes:
+        status: ok, discard or terminated.
+        time: where the slave stands [s]; on discard the last successful time, NaN if not told.
+    """
+
+    status: StepStatus
+    time: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What a program of calls gave.
+
+    Attributes:
+        results: one for each call that was executed, in order.
+        error: why the next call failed, or None. A step that was not ``ok`` is not an error:
+            it is the last result.
+        compute_time: seconds that the slave spent on the program, by its monotonic clock.
+    """
+
+    results: list[object]
+    error: DoublestepError | None
+    compute_time: float

@@ -1,0 +1,106 @@
+"""Who holds the slave, and the guard that lets every request take effect exactly once.
+
+A master claims a slave for its run and gets an epoch; each request carries the epoch and a
+sequence number that grows by one. A repeated number gets the reply that was stored, without a
+second effect; an old epoch is refused. Pure state: no clock, no bus.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from protocol.errors import SequenceError, SlaveBusyError
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """A master. ``since`` is for people: the wall-clock time of its claim."""
+
+    run: str
+    host: str
+    pid: int
+    since: str
+
+    def __str__(self) -> str:
+        return f"run {self.run} on {self.host} (pid {self.pid}) since {self.since}"
+
+
+class Claims:
+    """The present holder and its last request."""
+
+    def __init__(self) -> None:
+        self._holder: Holder | None = None
+        self._epoch = 0
+        self._sequence = 0
+        self._reply = b""
+
+    @property
+    def holder(self) -> Holder | None:
+        """Who holds the slave, if anybody."""
+        return self._holder
+
+    @property
+    def epoch(self) -> int:
+        """The present epoch; it grows with each claim."""
+        return self._epoch
+
+    def claim(self, holder: Holder) -> int:
+        """Give the slave to ``holder``; the same run asking again gets the same epoch.
+
+        Raises:
+            SlaveBusyError: another run holds it.
+        """
+        if self._holder is not None:
+            if self._holder.run == holder.run:
+                return self._epoch
+            raise SlaveBusyError(
+                f"busy: held by {self._holder}",
+                remedy="wait for that run to end, or start another slave under another name",
+            )
+        self._holder = holder
+        self._epoch += 1
+        self._sequence = 0
+        self._reply = b""
+        return self._epoch
+
+    def check(self, epoch: int) -> None:
+        """Refuse whoever is not the present holder.
+
+        Raises:
+            SequenceError: ``epoch`` is not the present one, or nobody holds the slave.
+        """
+        if self._holder is None or epoch != self._epoch:
+            held = f"held by {self._holder}" if self._holder else "held by nobody"
+            raise SequenceError(
+                f"the request has epoch {epoch}, the present one is {self._epoch} ({held})",
+                remedy="the slave was released or claimed again meanwhile: start the run again",
+            )
+
+    def release(self, epoch: int) -> None:
+        """Give the slave back.
+
+        Raises:
+            SequenceError: ``epoch`` is not the present one.
+        """
+        self.check(epoch)
+        self._holder = None
+
+    def admit(self, epoch: int, sequence: int) -> bytes | None:
+        """Whether to execute the request: None to go ahead, else the reply to give again.
+
+        Raises:
+            SequenceError: stale epoch, or neither the last sequence number nor the next.
+        """
+        self.check(epoch)
+        if sequence == self._sequence + 1:
+            return None
+        if sequence == self._sequence and self._reply:
+            return self._reply
+        raise SequenceError(
+            f"request {sequence} after request {self._sequence}: neither the next nor a repetition"
+        )
+
+    def record(self, sequence: int, reply: bytes) -> None:
+        """Keep the reply to the request that was just executed."""
+        self._sequence = sequence
+        self._reply = reply

@@ -1,0 +1,1 @@
+"""FMUs as slaves: one adapter per FMI version behind the one `Slave` contract."""

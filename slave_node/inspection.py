@@ -1,0 +1,68 @@
+"""What ``slave-node inspect`` shows."""
+
+from __future__ import annotations
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from protocol.slave import SlaveDescription
+
+_STATE = {
+    "native": "saved and restored by the model itself",
+    "none": "cannot be saved: only a fixed communication step is possible (--estimator none)",
+}
+
+
+def description_tables(description: SlaveDescription) -> list[Table]:
+    """The model, its variables and its capabilities as tables."""
+    return [_model(description), _variables(description)]
+
+
+def _model(description: SlaveDescription) -> Table:
+    table = Table(title=description.model, show_header=False, title_justify="left")
+    can = description.capabilities
+    rows = {
+        "kind": description.kind,
+        "generation tool": description.generation_tool,
+        "guid": description.guid,
+        "sha256": description.sha256,
+        "state": _STATE.get(description.state_kind, description.state_kind),
+        "state can be serialized": _yes(can.can_serialize_state),
+        "interpolates inputs": _yes(can.can_interpolate_inputs),
+        "output derivatives up to order": str(can.max_output_derivative_order),
+        "variable communication step size": _yes(can.can_handle_variable_step_size),
+        "direct feed-through": "; ".join(
+            f"{output} of {', '.join(inputs)}"
+            for output, inputs in description.feed_through.items()
+            if inputs
+        )
+        or "none",
+    }
+    for name, value in rows.items():
+        table.add_row(name, value or "-")
+    return table
+
+
+def _variables(description: SlaveDescription) -> Table:
+    table = Table(title="Variables", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in ("name", "causality", "variability", "type", "unit"):
+        table.add_column(column, no_wrap=True)
+    table.add_column("start", no_wrap=True, justify="right")
+    table.add_column("nominal", no_wrap=True, justify="right")
+    table.add_column("description", no_wrap=True, overflow="ellipsis", max_width=60)
+    for v in description.variables:
+        table.add_row(
+            v.name,
+            v.causality.value,
+            v.variability,
+            v.type.value,
+            v.unit,
+            "" if v.start is None else str(v.start),
+            "" if v.nominal == 1.0 else str(v.nominal),
+            v.description,
+        )
+    return table
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"

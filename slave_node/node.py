@@ -1,0 +1,298 @@
+"""The node: what a slave offers on the bus. Holds the bus and no model; always answers status.
+
+Knows no transport: it takes a `Bus` and a `Worker`. Requests are executed one at a time, in the
+order in which they came; ``status`` and ``abort`` are answered beside them.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+from collections.abc import Callable, Mapping
+from datetime import datetime
+
+from protocol.bus import Bus
+from protocol.calls import CALLS, Call, Reply, Reset
+from protocol.codec import (
+    PROTOCOL_VERSION,
+    decode_map,
+    decode_reply,
+    decode_request,
+    decode_single,
+    encode_error,
+    encode_error_map,
+    encode_map,
+    encode_program,
+    encode_single_reply,
+)
+from protocol.errors import (
+    ConfigurationError,
+    DoublestepError,
+    MalformedMessageError,
+    SequenceError,
+    SlaveBusyError,
+    SlaveCrashedError,
+    SlaveLostError,
+)
+from protocol.keys import (
+    ABORT,
+    CLAIM,
+    EXECUTE,
+    RELEASE,
+    STATUS,
+    SlaveKey,
+    alive_master,
+    alive_slaves,
+    check_name,
+)
+from protocol.slave import SlaveDescription, StartValue
+from slave_node.claims import Claims, Holder
+from slave_node.worker import Worker
+
+log = logging.getLogger("slave_node")
+
+_PEER_TIME = 1.0
+
+
+class SlaveNode:
+    """One slave on the bus.
+
+    Args:
+        bus: opened; the caller closes it.
+        worker: started; the caller stops it.
+        key: name and instance.
+        description: of the slave that ``worker`` holds.
+        orphan_time: a slave whose master vanished without release resets itself after this [s].
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        worker: Worker,
+        key: SlaveKey,
+        description: SlaveDescription,
+        orphan_time: float = 5.0,
+    ) -> None:
+        self._bus = bus
+        self._worker = worker
+        self._key = key
+        self._description = description
+        self._orphan_time = orphan_time
+        self._claims = Claims()
+        self._running = threading.Lock()
+        self._worker_alive = True
+        self._since = _now()
+
+    def serve(self) -> None:
+        """Serve until the bus is closed; the token goes up last: alive means serving.
+
+        Raises:
+            ConfigurationError: a slave of this name is on the bus already.
+        """
+        others = self._bus.alive(alive_slaves(self._key.name), _PEER_TIME)
+        if others:
+            raise ConfigurationError(
+                f"a slave named {self._key.name!r} is on the bus already: {', '.join(others)}",
+                remedy="end it, or serve this one under another --name",
+            )
+        key = self._key
+        self._bus.serve(key.verb(STATUS), self._status)
+        self._bus.serve(key.verb(ABORT), self._abort)
+        self._bus.serve(key.verb(CLAIM), self._claim)
+        self._bus.serve(key.verb(RELEASE), self._release)
+        for call in CALLS:
+            self._bus.serve(key.verb(call.verb), self._single(call))
+        self._bus.watch(alive_master("*"), self._master_changed)
+        self._bus.serve_here(key.verb(EXECUTE), self._execute, self._announce)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a request is being executed now."""
+        return self._running.locked()
+
+    def _announce(self) -> None:
+        self._bus.announce(self._key.alive)
+        log.info("ready: %s, instance %s", self._description.kind, self._key.instance)
+
+    def _execute(self, data: bytes) -> bytes:
+        """A request of the holder: the hot path."""
+        with self._running:
+            try:
+                epoch, sequence, program = decode_request(data)
+                again = self._claims.admit(epoch, sequence)
+                if again is not None:
+                    return again
+                reply = self._run(program)
+                self._claims.record(sequence, reply)
+            except DoublestepError as error:
+                return encode_error(error)
+            return reply
+
+    def _run(self, program: bytes) -> bytes:
+        try:
+            return self._worker.execute(program)
+        except SlaveCrashedError as error:
+            if self._worker_alive:
+                log.error("%s", error)
+            self._worker_alive = False
+            return encode_error(error)
+
+    def _single(self, cls: type[Call]) -> Callable[[bytes], bytes]:
+        """A verb by hand, while no master holds the slave."""
+
+        def handle(data: bytes) -> bytes:
+            with self._running:
+                try:
+                    holder = self._claims.holder
+                    if holder is not None:
+                        raise SlaveBusyError(f"busy: held by {holder}", phase=cls.verb)
+                    call = decode_single(cls, data)
+                    self._revive()
+                    reply = decode_reply([call], self._run(encode_program([call])))
+                except DoublestepError as error:
+                    reply = Reply([], error, 0.0)
+                return encode_single_reply(reply)
+
+        return handle
+
+    def _revive(self) -> None:
+        """A worker that died is started again, with the model as it was loaded first."""
+        if not self._worker_alive:
+            self._worker.start()
+            self._worker_alive = True
+
+    def _renew(self) -> None:
+        """A slave as good as new for the next master: reset, or loaded again if that fails."""
+        if self._worker_alive and self._reset() is None:
+            return
+        self._worker_alive = False
+        self._revive()
+
+    def _reset(self) -> DoublestepError | None:
+        """Reset the slave; why it could not be."""
+        calls = [Reset()]
+        return decode_reply(calls, self._run(encode_program(calls))).error
+
+    def _claim(self, data: bytes) -> bytes:
+        try:
+            holder = _holder(decode_map(data))
+            with self._running:
+                new = self._claims.holder is None
+                if new:
+                    self._renew()
+                epoch = self._claims.claim(holder)
+            if new:
+                log.info("claimed by %s", holder)
+        except DoublestepError as error:
+            log.warning("claim refused: %s", error)
+            return encode_error_map(error.located(slave=self._key.name, phase=CLAIM))
+        return encode_map({"epoch": epoch})
+
+    def _release(self, data: bytes) -> bytes:
+        try:
+            epoch = _epoch(decode_map(data))
+            with self._running:
+                holder = self._claims.holder
+                self._claims.release(epoch)
+                log.info("released by %s", holder)
+                self._reset()
+        except DoublestepError as error:
+            return encode_error_map(error.located(slave=self._key.name, phase=RELEASE))
+        return encode_map({})
+
+    def _abort(self, data: bytes) -> bytes:
+        """End the worker, even in the middle of a step; the next claim starts another.
+
+        Who says its epoch ends what it began and nothing later; an empty message ends anything.
+        """
+        try:
+            if data:
+                self._claims.check(_epoch(decode_map(data)))
+        except DoublestepError as error:
+            return encode_error_map(error.located(slave=self._key.name, phase=ABORT))
+        self._end_worker("aborted")
+        return encode_map({})
+
+    def _end_worker(self, reason: str) -> None:
+        log.warning("%s: ending the process that holds the model", reason)
+        self._worker.kill()
+        self._worker_alive = False
+
+    def _status(self, _: bytes) -> bytes:
+        holder = self._claims.holder
+        return encode_map(
+            {
+                "name": self._key.name,
+                "instance": self._key.instance,
+                "host": socket.gethostname(),
+                "pid": os.getpid(),
+                "model": self._description.model,
+                "kind": self._description.kind,
+                "sha256": self._description.sha256,
+                "state": "free" if holder is None else "held",
+                "busy": self.busy,
+                "worker": "alive" if self._worker_alive else "dead",
+                "holder": None if holder is None else str(holder),
+                "since": self._since,
+                "protocol_version": PROTOCOL_VERSION,
+            }
+        )
+
+    def _master_changed(self, key: str, alive: bool) -> None:
+        holder = self._claims.holder
+        if alive or holder is None or key != alive_master(holder.run):
+            return
+        log.warning("the master is gone: %s", holder)
+        wait = 0.0 if _has_ended(holder) else self._orphan_time
+        timer = threading.Timer(wait, self._reset_orphan, (self._claims.epoch,))
+        timer.daemon = True
+        timer.start()
+
+    def _reset_orphan(self, epoch: int) -> None:
+        """Give a slave back whose master is gone; a step under way is for nobody any more."""
+        holder = self._claims.holder
+        try:
+            if holder is None or self._bus.alive(alive_master(holder.run), _PEER_TIME):
+                return
+            self._claims.check(epoch)
+            if self.busy:
+                self._end_worker("its master is gone")
+            with self._running:
+                self._claims.release(epoch)
+                log.warning("reset; free for another master")
+                self._reset()
+        except (SequenceError, SlaveLostError) as error:
+            log.info("not reset: %s", error)  # released meanwhile, or the node is ending
+
+
+def _holder(claim: Mapping[str, StartValue]) -> Holder:
+    run, host, pid = claim.get("run"), claim.get("host"), claim.get("pid")
+    if type(run) is not str or type(host) is not str or type(pid) is not int:
+        raise MalformedMessageError("a claim must hold run and host as texts, and pid as a number")
+    return Holder(check_name(run, "run id"), host, pid, _now())
+
+
+def _epoch(message: Mapping[str, StartValue]) -> int:
+    epoch = message.get("epoch")
+    if type(epoch) is not int:
+        raise MalformedMessageError("the message must hold an epoch")
+    return epoch
+
+
+def _has_ended(holder: Holder) -> bool:
+    """True when the holder was a process on this host that is no more."""
+    if holder.host != socket.gethostname() or holder.pid <= 0 or os.name != "posix":
+        return False
+    try:
+        os.kill(holder.pid, 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:
+        return False
+    return False
+
+
+def _now() -> str:
+    return datetime.now().astimezone().isoformat(timespec="seconds")

@@ -1,0 +1,70 @@
+"""The saved states of one slave, by the numbers that the master gave them; bounded."""
+
+from __future__ import annotations
+
+from protocol.errors import SlaveError
+from protocol.slave import Slave
+
+LIMIT = 16
+"""A double step holds two; more than this is a master that forgets to free them."""
+
+
+class SnapshotStore:
+    """Owns the saved states: each is freed exactly once, at the latest by `clear`."""
+
+    def __init__(self, slave: Slave, limit: int = LIMIT) -> None:
+        self._slave = slave
+        self._limit = limit
+        self._states: dict[int, object] = {}
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+    def save(self, number: int) -> None:
+        """Save the slave's state under ``number``.
+
+        Raises:
+            SlaveError: the number is taken, the store is full, or the slave cannot.
+        """
+        self._check_room(number)
+        self._states[number] = self._slave.get_state()
+
+    def restore(self, number: int) -> None:
+        """Let the slave go back to the state; it stays saved."""
+        self._slave.set_state(self._get(number))
+
+    def free(self, number: int) -> None:
+        """Give the state up."""
+        state = self._get(number)
+        del self._states[number]
+        self._slave.free_state(state)
+
+    def serialize(self, number: int) -> bytes:
+        """The state as bytes."""
+        return self._slave.serialize_state(self._get(number))
+
+    def deserialize(self, number: int, data: bytes) -> None:
+        """Make the state from bytes."""
+        self._check_room(number)
+        self._states[number] = self._slave.deserialize_state(data)
+
+    def clear(self) -> None:
+        """Free all."""
+        while self._states:
+            _, state = self._states.popitem()
+            self._slave.free_state(state)
+
+    def _get(self, number: int) -> object:
+        try:
+            return self._states[number]
+        except KeyError:
+            saved = ", ".join(map(str, sorted(self._states))) or "none"
+            raise SlaveError(f"no state is saved under number {number}; saved: {saved}") from None
+
+    def _check_room(self, number: int) -> None:
+        if number in self._states:
+            raise SlaveError(f"a state is already saved under number {number}")
+        if len(self._states) >= self._limit:
+            raise SlaveError(
+                f"{self._limit} states are saved already", remedy="free states that are not needed"
+            )

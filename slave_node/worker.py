@@ -1,0 +1,242 @@
+"""The worker process: single-threaded, holds the model, and holds no Zenoh session.
+
+A crash or an endless loop in a model ends or blocks this process only; the node beside it still
+answers. Programs and replies go through a pipe as the bytes that are on the wire.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import multiprocessing
+import os
+import shutil
+import signal
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Protocol
+
+from protocol.calls import Call, Describe, Initialize, Reply
+from protocol.codec import decode_program, decode_reply, encode_error, encode_program, encode_reply
+from protocol.errors import (
+    DeadlineError,
+    DoublestepError,
+    MalformedMessageError,
+    SlaveCrashedError,
+)
+from protocol.slave import CallExecutor, SlaveDescription, StartValue
+
+_END = b""
+_CLOSE_TIME = 0.5
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ModelReference:
+    """What to load: see `slave_node.loading.load_slave`; ``parameters`` are start values that
+    hold unless the master gives others.
+    """
+
+    model: str
+    base: Path
+    name: str
+    parameters: Mapping[str, StartValue] = field(default_factory=dict)
+    log_all: bool = False
+
+
+class Worker(Protocol):
+    """Where programs are executed."""
+
+    def start(self) -> SlaveDescription:
+        """Load the model, in place of what there was before; raises what its loading raised."""
+        ...
+
+    def execute(self, program: bytes) -> bytes:
+        """The reply to a program.
+
+        Raises:
+            SlaveCrashedError: the worker is dead; ``start`` makes a new one.
+        """
+        ...
+
+    def kill(self) -> None:
+        """End it at once, even in the middle of a step. From any thread."""
+        ...
+
+    def stop(self) -> None:
+        """Free the model and end it in a bounded time."""
+        ...
+
+
+def execute_program(executor: CallExecutor, reference: ModelReference, program: bytes) -> bytes:
+    """Decode, execute, encode: never raises."""
+    try:
+        calls = [_with_parameters(call, reference) for call in decode_program(program)]
+        reply = executor.execute(calls)
+    except DoublestepError as error:
+        reply = Reply([], error, 0.0)
+    return encode_reply(reply)
+
+
+def _with_parameters(call: Call, reference: ModelReference) -> Call:
+    if type(call) is Initialize and reference.parameters:
+        values = {**reference.parameters, **call.start_values}
+        return Initialize(
+            call.start_time,
+            call.stop_time,
+            call.relative_tolerance,
+            values,
+            call.inputs,
+            call.outputs,
+        )
+    return call
+
+
+class WorkerProcess:
+    """Implements `Worker` with a process of its own.
+
+    Args:
+        reference: the model.
+        load_time: bound on loading the model [s].
+    """
+
+    def __init__(self, reference: ModelReference, load_time: float = 60.0) -> None:
+        self._reference = reference
+        self._load_time = load_time
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._pipe: Connection | None = None
+        self._scratch: str | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process, None when there is none."""
+        return self._process.pid if self._process else None
+
+    def start(self) -> SlaveDescription:
+        """See `Worker`. On Linux the process ends with the thread that called this."""
+        self._discard()
+        self._scratch = tempfile.mkdtemp(prefix="doublestep-")
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_main, args=(theirs, self._reference, self._scratch), daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        try:
+            if not self._pipe.poll(self._load_time):
+                raise DeadlineError(
+                    f"the model was not loaded within {self._load_time:g} s", phase="load"
+                )
+            data = self._pipe.recv_bytes()
+        except (EOFError, OSError):
+            raise self._crashed() from None
+        except DeadlineError:
+            self._discard()
+            raise
+        reply = decode_reply([Describe()], data)
+        if reply.error is not None:
+            self._discard()
+            raise reply.error
+        description = reply.results[0]
+        assert isinstance(description, SlaveDescription)
+        return description
+
+    def execute(self, program: bytes) -> bytes:
+        """See `Worker`."""
+        if not program:  # on the pipe it means the end
+            return encode_error(MalformedMessageError("a program is empty"))
+        if self._pipe is None:
+            raise SlaveCrashedError(
+                "the process that held the model is gone", remedy="claim the slave again"
+            )
+        try:
+            self._pipe.send_bytes(program)
+            return self._pipe.recv_bytes()
+        except (EOFError, OSError):
+            raise self._crashed() from None
+
+    def kill(self) -> None:
+        """See `Worker`."""
+        process = self._process
+        if process is not None and process.is_alive():
+            process.kill()
+
+    def stop(self) -> None:
+        """See `Worker`."""
+        if self._pipe is not None and self._process is not None:
+            try:
+                self._pipe.send_bytes(_END)
+            except OSError:
+                pass
+            else:
+                self._process.join(_CLOSE_TIME)
+        self._discard()
+
+    def _crashed(self) -> SlaveCrashedError:
+        assert self._process is not None
+        self._process.join(_CLOSE_TIME)
+        code = self._process.exitcode
+        self._discard()
+        if code is not None and code < 0:
+            how = f"died by {signal.Signals(-code).name}"
+        else:
+            how = f"ended with exit code {code}"
+        return SlaveCrashedError(f"the process that held the model {how}")
+
+    def _discard(self) -> None:
+        if self._process is not None:
+            if self._process.is_alive():
+                self._process.kill()
+            self._process.join(_CLOSE_TIME)
+            self._process = None
+        if self._pipe is not None:
+            self._pipe.close()
+            self._pipe = None
+        if self._scratch is not None:
+            shutil.rmtree(self._scratch, ignore_errors=True)
+            self._scratch = None
+
+
+def _main(pipe: Connection, reference: ModelReference, scratch: str) -> None:
+    """Load the model, then execute programs until the node says end or is gone."""
+    _die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        from slave_node.executor import Executor  # noqa: PLC0415
+        from slave_node.loading import load_slave  # noqa: PLC0415  after the process is set up
+
+        executor = Executor(
+            load_slave(
+                reference.model,
+                reference.base,
+                reference.name,
+                Path(scratch),
+                log_all=reference.log_all,
+            )
+        )
+    except DoublestepError as error:
+        pipe.send_bytes(encode_reply(Reply([], error, 0.0)))
+        return
+    try:
+        pipe.send_bytes(execute_program(executor, reference, encode_program([Describe()])))
+        while program := pipe.recv_bytes():
+            pipe.send_bytes(execute_program(executor, reference, program))
+    except (EOFError, ConnectionError):
+        logging.getLogger(__name__).warning("the node is gone: ending")
+    finally:
+        executor.close()
+
+
+def _die_with_parent() -> None:
+    """Even in the middle of a step; elsewhere than on Linux the closed pipe ends an idle worker."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        parent = multiprocessing.parent_process()
+        if parent is not None and os.getppid() != parent.pid:
+            os._exit(0)  # it was gone before

@@ -1,0 +1,92 @@
+"""What several test modules share."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from secrets import token_hex
+from types import ModuleType
+
+import psutil
+import pytest
+
+BUILD_SCRIPT = Path(__file__).parents[1] / "examples" / "quarter_car" / "build.py"
+
+_MARK = "DOUBLESTEP_TEST_SESSION"
+_TIME_TO_END = 3.0
+
+
+@pytest.fixture(scope="session")
+def build_script() -> ModuleType:
+    """The script that builds the example FMUs, from where it lies: examples are not a package."""
+    spec = importlib.util.spec_from_file_location("quarter_car_build", BUILD_SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def fmu_dir(build_script: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the four FMUs."""
+    folder = tmp_path_factory.mktemp("quarter_car")
+    build_script.build(folder)
+    return folder
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """An address on loopback that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+Survivors = Callable[[], list[psutil.Process]]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def survivors() -> Iterator[Survivors]:
+    """The processes that tests started and that do not end in a bounded time.
+
+    A mark in the environment finds them even when they lost their parent. Asked once more at the
+    end of the session: nothing that a test started may outlive it.
+    """
+    mark = token_hex(8)
+    os.environ[_MARK] = mark
+
+    def find() -> list[psutil.Process]:
+        marked = [process for process in psutil.process_iter() if _is_marked(process, mark)]
+        _, alive = psutil.wait_procs(marked, timeout=_TIME_TO_END)
+        return alive
+
+    yield find
+    left = [process.cmdline() for process in find()]
+    del os.environ[_MARK]
+    assert not left, f"processes are left running: {left}"
+
+
+def _is_marked(process: psutil.Process, mark: str) -> bool:
+    try:
+        if process.pid == os.getpid() or process.status() == psutil.STATUS_ZOMBIE:
+            return False
+        # multiprocessing keeps a resource tracker for as long as the session lives.
+        return process.environ().get(_MARK) == mark and not any(
+            "resource_tracker" in argument for argument in process.cmdline()
+        )
+    except psutil.Error:
+        return False
+
+
+@pytest.fixture
+def no_process_left(survivors: Survivors) -> Iterator[None]:
+    """Fails the test after which a process that it started goes on."""
+    yield
+    left = survivors()
+    for process in left:
+        process.kill()
+    assert not left, f"processes are left running: {left}"
