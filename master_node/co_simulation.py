@@ -171,7 +171,7 @@ class CoSimulation:
             order = estimator.order(settings.order, len(history.times))
             solution = stepper.attempt(history, h, order, stop if is_last else None)
             if isinstance(solution, DoubleStep):
-                error = estimator(solution.y, solution.y_comparison, ratios[order])
+                error = estimator.estimate(solution.y, solution.y_comparison, ratios[order])
                 norm, worst = weighted_rms_norm(
                     error, solution.y, coupled.absolute_tolerance, coupled.relative_tolerance
                 )
@@ -182,9 +182,7 @@ class CoSimulation:
                 if decision.accepted:
                     errors_in_a_row = 0
                     stepper.accepted()
-                    history = history.pushed(
-                        solution.middle, solution.y_middle[coupled.source]
-                    ).pushed(solution.end, solution.y[coupled.source])
+                    history = solution.history.pushed(solution.end, solution.y[coupled.source])
                     self._accept(statistics, h, 2, solution.end)
                     self.observer.attempted(
                         Attempt(
@@ -269,7 +267,7 @@ class CoSimulation:
                 for part, k in zip(coupled.parts, orders, strict=True)
             ]
             replies = self.group.execute(programs, time, end - time)
-            self.group.count(programs, replies)
+            self.group.count_all(1, 0)
             for name, reply in zip(self.group.names, replies, strict=True):
                 if reply.error is not None:
                     raise reply.error
@@ -286,7 +284,7 @@ class CoSimulation:
                         step_size=end - time,
                         remedy="lower --step-size, or use an estimator, which repeats such steps",
                     )
-            y = gather(replies, -1, len(names))
+            y = gather(replies, -1)
             if not np.isfinite(y).all():
                 bad = names[int(np.argmin(np.isfinite(y)))]
                 raise SlaveError(

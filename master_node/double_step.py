@@ -8,8 +8,8 @@ of slaves:
     EST_mod   1: GetState, SetInputs(u), DoStep(T, H), GetState, DoStep(T+H, H), SetState
               2: SetInputs(u_new), DoStep(T+H, H)
 
-What the last attempt left behind rides along in front of request 1: after an accepted step the
-old state is freed, after a rejected one it is restored.
+In front of request 1 stands what the last attempt calls for: after an accepted step the state is
+saved (over the old one, which is freed with that), after a rejected one the old one is restored.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from master_node.initialization import gather
 from master_node.numerics.error_estimators import Comparison, ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory
+from master_node.numerics.norms import first_not_finite
 from master_node.slave_group import Program, SlaveGroup
 from master_node.system import CoupledSystem
 from protocol.calls import (
+    Call,
     DoStep,
-    FreeState,
     GetOutputs,
     GetState,
     Reply,
@@ -44,15 +43,9 @@ _HALFWAY = 1
 _GET_OUTPUTS = GetOutputs()
 _SAVE_POINT = GetState(_AT_POINT)
 _RESTORE_POINT = SetState(_AT_POINT)
-_FREE_POINT = FreeState(_AT_POINT)
 _SAVE_HALFWAY = GetState(_HALFWAY)
 _RESTORE_HALFWAY = SetState(_HALFWAY)
-_FREE_HALFWAY = FreeState(_HALFWAY)
-
-_FIRST: Program = (_SAVE_POINT,)
-_AFTER_ACCEPTED: Program = (_FREE_POINT, _SAVE_POINT)
-_AFTER_REJECTED: Program = (_RESTORE_POINT,)
-_AFTER_REJECTED_HALFWAY: Program = (_RESTORE_POINT, _FREE_HALFWAY)
+_STEPS_IN_FIRST = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +55,7 @@ class DoubleStep:
     Attributes:
         middle, end: T_n + H and T_n + 2H [s].
         y_middle, y: outputs of the two small steps there, shape (m,).
+        history: inputs at the communication points up to T_n + H.
         y_comparison: the comparison solution at T_n + 2H, shape (m,).
     """
 
@@ -70,6 +64,7 @@ class DoubleStep:
     y_middle: FloatArray
     y: FloatArray
     y_comparison: FloatArray
+    history: CouplingHistory
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +72,7 @@ class FailedStep:
     """A double step that a slave, or a value that is not finite, broke off.
 
     Attributes:
-        slave: its name.
+        slave: its name; "" when it was a value that is not finite.
         status: ``DISCARD`` or ``TERMINATED`` when the slave said so; None after an error or a
             value that is not finite.
         reached: which part of its step the slave completed, 0 to 1; NaN when unknown.
@@ -92,9 +87,6 @@ class FailedStep:
     error: DoublestepError | None = None
 
 
-_Inputs = Sequence[FloatArray]
-
-
 class _Request(Protocol):
     """Request 1, (A) to (F), for one comparison solution.
 
@@ -107,9 +99,9 @@ class _Request(Protocol):
     COMPARISON: int
 
     def __call__(
-        self, history: CouplingHistory, order: int, middle: float, first: float, second: float
-    ) -> tuple[list[InputSignal], Callable[[_Inputs], Program]]:
-        """The input signals, and how a slave's program is made of its parts of them."""
+        self, history: CouplingHistory, order: int, first: float, second: float
+    ) -> tuple[InputSignal, InputSignal, Callable[[FloatArray, FloatArray], Program]]:
+        """The two input signals, and how a slave's program is made of its parts of both."""
         ...
 
 
@@ -120,54 +112,53 @@ class _LongStepRequest:
     COMPARISON = -5
 
     def __call__(
-        self, history: CouplingHistory, order: int, middle: float, first: float, second: float
-    ) -> tuple[list[InputSignal], Callable[[_Inputs], Program]]:
+        self, history: CouplingHistory, order: int, first: float, second: float
+    ) -> tuple[InputSignal, InputSignal, Callable[[FloatArray, FloatArray], Program]]:
         time = history.times[0]
         long_step = DoStep(time, first + second, True)
         step = DoStep(time, first, True)
 
-        def program(u: _Inputs) -> Program:
+        def program(u_long: FloatArray, u: FloatArray) -> Program:
             return (
-                SetInputs(u[0]),
+                SetInputs(u_long),
                 long_step,
                 _GET_OUTPUTS,
                 _RESTORE_POINT,
-                SetInputs(u[1]),
+                SetInputs(u),
                 step,
                 _GET_OUTPUTS,
             )
 
-        return [history.long_signal(order), history.signal(order)], program
+        return history.long_signal(order), history.signal(order), program
 
 
 class _SamePolynomialRequest:
     """EST_mod: the first small step, on with its polynomial, then back halfway."""
 
-    MIDDLE = -7
-    COMPARISON = -3
+    MIDDLE = -6
+    COMPARISON = -2
 
     def __call__(
-        self, history: CouplingHistory, order: int, middle: float, first: float, second: float
-    ) -> tuple[list[InputSignal], Callable[[_Inputs], Program]]:
+        self, history: CouplingHistory, order: int, first: float, second: float
+    ) -> tuple[InputSignal, InputSignal, Callable[[FloatArray, FloatArray], Program]]:
         time = history.times[0]
         step = DoStep(time, first, True)
-        comparison_step = DoStep(middle, second, False)
+        comparison_step = DoStep(time + first, second, False)
         signal = history.signal(order)
 
-        def program(u: _Inputs) -> Program:
+        def program(u: FloatArray, u_middle: FloatArray) -> Program:
             return (
-                SetInputs(u[0]),
+                SetInputs(u),
                 step,
                 _GET_OUTPUTS,
                 _SAVE_HALFWAY,
-                SetInputs(u[1]),
+                SetInputs(u_middle),
                 comparison_step,
                 _GET_OUTPUTS,
                 _RESTORE_HALFWAY,
-                _FREE_HALFWAY,
             )
 
-        return [signal, signal.shifted(first)], program
+        return signal, signal.shifted(first), program
 
 
 _REQUESTS: Mapping[Comparison, _Request] = {
@@ -196,12 +187,10 @@ class DoubleStepper:
         self._group = group
         self._source = coupled.source
         self._names = coupled.output_names
-        self._m = len(coupled.output_names)
-        self._parts = [
-            (part.input_slice, order) for part, order in zip(coupled.parts, orders, strict=True)
-        ]
+        self._slices = [part.input_slice for part in coupled.parts]
+        self._rows = [order + 1 for order in orders]
         self._first_request = _REQUESTS[estimator.comparison]
-        self._prelude: list[Program] = [_FIRST] * len(group)
+        self._first_call: Call = _SAVE_POINT
 
     def attempt(
         self, history: CouplingHistory, step_size: float, order: int, stop_time: float | None
@@ -220,68 +209,79 @@ class DoubleStepper:
         Raises:
             DoublestepError: a slave is lost, or failed in a way that a smaller step cannot help.
         """
-        middle = history.times[0] + step_size
+        time = history.times[0]
+        middle = time + step_size
         second = step_size if stop_time is None else stop_time - middle
         end = middle + step_size if stop_time is None else stop_time
 
         request = self._first_request
-        signals, program = request(history, order, middle, step_size, second)
-        split = zip(*(self._split(signal) for signal in signals), strict=True)
-        programs = [prelude + program(u) for prelude, u in zip(self._prelude, split, strict=True)]
-        replies = self._group.execute(programs, history.times[0], step_size)
-        failed = self._failed(programs, replies)
+        signal_1, signal_2, program = request(history, order, step_size, second)
+        d_1, d_2 = signal_1.derivatives, signal_2.derivatives
+        programs = [
+            (self._first_call, *program(d_1[:rows, part], d_2[:rows, part]))
+            for part, rows in zip(self._slices, self._rows, strict=True)
+        ]
+        replies = self._group.execute(programs, time, step_size)
+        rollbacks = 2 if self._first_call is _RESTORE_POINT else 1
+        failed = self._failed(programs, replies, _STEPS_IN_FIRST, rollbacks)
         if failed is not None:
             return failed
-        y_middle = gather(replies, request.MIDDLE, self._m)
-        y_comparison = gather(replies, request.COMPARISON, self._m)
-        if not np.isfinite(y_middle).all():
-            name = self._names[int(np.argmin(np.isfinite(y_middle)))]
-            return FailedStep(name.partition(".")[0], None, float("nan"), f"{name} is not finite")
+        y_middle = gather(replies, request.MIDDLE)
+        y_comparison = gather(replies, request.COMPARISON)
+        bad = first_not_finite(y_middle)
+        if bad is not None:
+            return FailedStep("", None, float("nan"), f"{self._names[bad]} is not finite")
 
-        following = history.pushed(middle, y_middle[self._source]).signal(order)
+        history = history.pushed(middle, y_middle[self._source])
+        d = history.signal(order).derivatives
         step = DoStep(middle, second, False)
-        programs = [(SetInputs(u), step, _GET_OUTPUTS) for u in self._split(following)]
+        programs = [
+            (SetInputs(d[:rows, part]), step, _GET_OUTPUTS)
+            for part, rows in zip(self._slices, self._rows, strict=True)
+        ]
         replies = self._group.execute(programs, middle, step_size)
-        failed = self._failed(programs, replies)
+        failed = self._failed(programs, replies, 1, 0)
         if failed is not None:
             return failed
-        return DoubleStep(middle, end, y_middle, gather(replies, -1, self._m), y_comparison)
+        y = gather(replies, -1)
+        return DoubleStep(middle, end, y_middle, y, y_comparison, history)
 
     def accepted(self) -> None:
         """Go on from the end: the state saved at T_n is not needed any more."""
-        self._prelude = [_AFTER_ACCEPTED] * len(self._group)
+        self._first_call = _SAVE_POINT
 
     def rejected(self) -> None:
         """Go back to T_n."""
-        self._prelude = [
-            prelude if prelude is _AFTER_REJECTED_HALFWAY else _AFTER_REJECTED
-            for prelude in self._prelude
-        ]
+        self._first_call = _RESTORE_POINT
 
-    def _split(self, signal: InputSignal) -> list[FloatArray]:
-        """Each slave's part of the input signal, up to the degree that the slave can take."""
-        d = signal.derivatives
-        return [d[: order + 1, part] for part, order in self._parts]
-
-    def _failed(self, programs: Sequence[Program], replies: Sequence[Reply]) -> FailedStep | None:
-        """Count what was executed; the first slave that did not get to the end, if any."""
-        self._group.count(programs, replies)
-        failed: FailedStep | None = None
+    def _failed(
+        self,
+        programs: Sequence[Program],
+        replies: Sequence[Reply],
+        do_steps: int,
+        rollbacks: int,
+    ) -> FailedStep | None:
+        """Count what was executed; which slave did not get to the end, if any."""
+        if all(map(_complete, programs, replies)):
+            self._group.count_all(do_steps, rollbacks)
+            return None
+        failures = []
         for i, (name, program, reply) in enumerate(
             zip(self._group.names, programs, replies, strict=True)
         ):
-            executed = len(reply.results)
-            if executed == len(program):
-                self._prelude[i] = ()
+            done = program[: len(reply.results)]
+            self._group.count(i, done)
+            if len(done) == len(program):
                 continue
-            done = program[:executed]
-            halfway = _SAVE_HALFWAY in done and _FREE_HALFWAY not in done
-            self._prelude[i] = _AFTER_REJECTED_HALFWAY if halfway else _AFTER_REJECTED
             if reply.error is not None and not isinstance(reply.error, StepRejectedError):
                 raise reply.error
-            if failed is None or failed.status is not StepStatus.TERMINATED:
-                failed = _failure(name, program, reply)
-        return failed
+            failures.append(_failure(name, program, reply))
+        terminated = [f for f in failures if f.status is StepStatus.TERMINATED]
+        return (terminated or failures)[0]
+
+
+def _complete(program: Program, reply: Reply) -> bool:
+    return len(reply.results) == len(program)
 
 
 def _failure(slave: str, program: Program, reply: Reply) -> FailedStep:

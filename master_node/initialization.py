@@ -36,7 +36,7 @@ def initialize(group: SlaveGroup, coupled: CoupledSystem, system: System) -> Flo
     group.execute_all([_initialize(part.name, coupled, system) for part in coupled.parts], start)
     y = _propagate(group, coupled, start)
     programs = [(ExitInitializationMode(), GetOutputs()) for _ in coupled.parts]
-    y = gather(group.execute_all(programs, start), -1, len(y))
+    y = gather(group.execute_all(programs, start), -1)
     finite = np.isfinite(y)
     if not finite.all():
         name = coupled.output_names[int(np.argmin(finite))]
@@ -44,15 +44,9 @@ def initialize(group: SlaveGroup, coupled: CoupledSystem, system: System) -> Flo
     return y
 
 
-def gather(replies: Sequence[Reply], position: int, n: int) -> FloatArray:
-    """The outputs at one position of each reply, one after the other, shape (n,)."""
-    y = np.empty(n)
-    end = 0
-    for reply in replies:
-        outputs: FloatArray = reply.results[position][0]  # type: ignore[index]
-        begin, end = end, end + len(outputs)
-        y[begin:end] = outputs
-    return y
+def gather(replies: Sequence[Reply], position: int) -> FloatArray:
+    """The outputs at one position of each reply, one after the other, shape (m,)."""
+    return np.concatenate([reply.results[position][0] for reply in replies])  # type: ignore[index]
 
 
 def _initialize(slave: str, coupled: CoupledSystem, system: System) -> Program:
@@ -73,9 +67,8 @@ def _initialize(slave: str, coupled: CoupledSystem, system: System) -> Program:
 def _propagate(group: SlaveGroup, coupled: CoupledSystem, start: float) -> FloatArray:
     """Y in initialization mode after enough rounds for every level to have settled."""
     starts = np.concatenate([part.input_starts for part in coupled.parts])
-    m = len(coupled.output_names)
     replies = group.execute_all([(GetOutputs(),) for _ in coupled.parts], start)
-    y = gather(replies, -1, m)
+    y = gather(replies, -1)
     if coupled.loop:
         return _iterate(group, coupled, start, y)
     for level in range(int(coupled.initial_levels.max()) + 1):
@@ -88,7 +81,7 @@ def _round(group: SlaveGroup, coupled: CoupledSystem, u: FloatArray, start: floa
     programs = [
         (SetInputs(u[np.newaxis, part.input_slice]), GetOutputs()) for part in coupled.parts
     ]
-    return gather(group.execute_all(programs, start), -1, len(coupled.output_names))
+    return gather(group.execute_all(programs, start), -1)
 
 
 def _iterate(group: SlaveGroup, coupled: CoupledSystem, start: float, y: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from protocol.signals import FloatArray
 
@@ -32,8 +32,7 @@ class RunStart:
     outputs: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class Attempt:
+class Attempt(NamedTuple):
     """One attempted double step (or one single step when there is no estimator).
 
     Attributes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from time import perf_counter
 
 from master_node.observers import SlaveStatistics
@@ -45,7 +45,8 @@ class SlaveGroup:
 
         Args:
             programs: one for each slave, in order.
-            time, step_size: where the run stands, for error messages [s].
+            time: where the run stands [s], for error messages.
+            step_size: communication step size H [s], for error messages.
 
         Returns:
             The replies in order. A reply's own ``error`` is located but not raised.
@@ -55,23 +56,20 @@ class SlaveGroup:
         """
         begin = perf_counter()
         failure: DoublestepError | None = None
-        started = []
-        for name, link, program in zip(self.names, self._links, programs, strict=True):
+        replies = []
+        pending: list[SlaveLink] = []
+        for link, program in zip(self._links, programs, strict=True):
             try:
                 link.start(program)
-                started.append(True)
             except DoublestepError as error:
-                started.append(False)
-                failure = failure or error.located(slave=name, phase=_phase(program))
-        replies = []
-        for index, link in enumerate(self._links):
-            if not started[index]:
-                continue
+                failure = failure or self._located(error, len(pending), program)
+                break
+            pending.append(link)
+        for index, link in enumerate(pending):
             try:
                 reply = link.finish()
             except DoublestepError as error:
-                phase = _phase(programs[index])
-                failure = failure or error.located(slave=self.names[index], phase=phase)
+                failure = failure or self._located(error, index, programs[index])
                 continue
             replies.append(reply)
             statistics = self._statistics[index]
@@ -85,6 +83,11 @@ class SlaveGroup:
             raise failure.located(time=time, step_size=step_size)
         return replies
 
+    def _located(self, error: DoublestepError, index: int, program: Program) -> DoublestepError:
+        """Name the slave, and the call that a lost request was about: its step, if it has one."""
+        steps = [call.verb for call in program if isinstance(call, DoStep)]
+        return error.located(slave=self.names[index], phase=(steps or [program[0].verb])[0])
+
     def execute_all(self, programs: Sequence[Program], time: float) -> list[Reply]:
         """The same for programs that must succeed as a whole.
 
@@ -97,18 +100,18 @@ class SlaveGroup:
                 raise reply.error
         return replies
 
-    def count(self, programs: Sequence[Program], replies: Sequence[Reply]) -> None:
-        """Add the do_steps and rollbacks that were executed to the statistics."""
-        for statistics, program, reply in zip(self._statistics, programs, replies, strict=True):
-            for call, _ in zip(program, reply.results, strict=False):
-                kind = type(call)
-                if kind is DoStep:
-                    statistics.do_steps += 1
-                elif kind is SetState:
-                    statistics.rollbacks += 1
+    def count(self, index: int, executed: Iterable[Call]) -> None:
+        """Add the do_steps and rollbacks of what slave ``index`` executed to its statistics."""
+        statistics = self._statistics[index]
+        for call in executed:
+            kind = type(call)
+            if kind is DoStep:
+                statistics.do_steps += 1
+            elif kind is SetState:
+                statistics.rollbacks += 1
 
-
-def _phase(program: Program) -> str:
-    """The call that a lost request was about: its step, if it has one."""
-    steps = [call.verb for call in program if isinstance(call, DoStep)]
-    return steps[0] if steps else program[0].verb
+    def count_all(self, do_steps: int, rollbacks: int) -> None:
+        """The same for all slaves, when each executed its whole program."""
+        for statistics in self._statistics:
+            statistics.do_steps += do_steps
+            statistics.rollbacks += rollbacks

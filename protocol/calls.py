@@ -93,7 +93,10 @@ class GetOutputs:
 
 @dataclass(frozen=True, slots=True)
 class GetState:
-    """fmi2GetFMUstate: save the state under the number ``state``. Result: None."""
+    """fmi2GetFMUstate: save the state under the number ``state``. Result: None.
+
+    A state that was saved under that number before is freed.
+    """
 
     verb: ClassVar[str] = "get_state"
     state: int
@@ -125,7 +128,10 @@ class SerializeState:
 
 @dataclass(frozen=True, slots=True)
 class DeserializeState:
-    """fmi2DeSerializeFMUstate: make ``data`` the saved state ``state``. Result: None."""
+    """fmi2DeSerializeFMUstate: make ``data`` the saved state ``state``. Result: None.
+
+    A state that was saved under that number before is freed.
+    """
 
     verb: ClassVar[str] = "deserialize_state"
     state: int
@@ -191,8 +197,7 @@ class StepResult(NamedTuple):
     time: float
 
 
-@dataclass(frozen=True, slots=True)
-class Reply:
+class Reply(NamedTuple):
     """What a program of calls gave.
 
     Attributes:

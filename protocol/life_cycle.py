@@ -93,17 +93,7 @@ LIFE_CYCLE: Mapping[LifeCycleState, Mapping[type[Call], LifeCycleState]] = {
 }
 
 
-def next_state(state: LifeCycleState, call: type[Call]) -> LifeCycleState:
-    """The state after a successful ``call``.
-
-    Raises:
-        LifeCycleError: ``state`` does not allow ``call``; nothing was done.
-    """
-    allowed = LIFE_CYCLE[state]
-    try:
-        return allowed[call]
-    except KeyError:
-        verbs = ", ".join(sorted(c.verb for c in allowed))
-        raise LifeCycleError(
-            f"not allowed in state '{state}', which allows {verbs}", phase=call.verb
-        ) from None
+def refusal(state: LifeCycleState, call: type[Call]) -> LifeCycleError:
+    """The error for a ``call`` that ``state`` does not allow; nothing was done."""
+    verbs = ", ".join(sorted(c.verb for c in LIFE_CYCLE[state]))
+    return LifeCycleError(f"not allowed in state '{state}', which allows {verbs}", phase=call.verb)

@@ -39,11 +39,13 @@ class InputSignal:
     def shifted(self, offset: float) -> InputSignal:
         """The same polynomial around T + offset."""
         d = self.derivatives
-        k = self.order
+        k = len(d) - 1
         if k == 0:
             return self
-        rows = np.empty_like(d)
-        rows[k] = d[k]
+        rows = d.copy()
+        if k == 1:
+            rows[0] += d[1] * offset
+            return InputSignal(rows)
         for j in range(k):
             value = d[k]
             for i in range(k, j, -1):

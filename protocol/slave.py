@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
-from protocol.calls import Call, Reply
+from protocol.calls import Call, Reply, StepResult
 from protocol.signals import FloatArray
 
 StartValue = float | int | bool | str
@@ -161,7 +161,7 @@ class Slave(ABC):
     @abstractmethod
     def do_step(
         self, communication_point: float, step_size: float, no_set_state_prior: bool
-    ) -> tuple[StepStatus, float]:
+    ) -> StepResult:
         """Step from ``communication_point`` by ``step_size`` [s].
 
         Returns the status and the time reached: the end of the step, or on ``DISCARD`` the last

@@ -195,28 +195,27 @@ class ZenohBus(Bus):
 class _ZenohCaller(Caller):
     def __init__(self, querier: zenoh.Querier, key: str, timeout: float) -> None:
         self._querier = querier
-        self._key = key
-        self._timeout = timeout
+        self.key = key
+        self.timeout = timeout
         self._token = zenoh.CancellationToken()
 
     def send(self, payload: bytes) -> PendingReply:
         try:
             channel = self._querier.get(payload=payload, cancellation_token=self._token)
         except zenoh.ZError as error:
-            raise SlaveLostError(f"cannot ask {self._key}: {_first_line(error)}") from error
-        return _ZenohReply(channel, self._key, self._timeout)
+            raise SlaveLostError(f"cannot ask {self.key}: {_first_line(error)}") from error
+        return _ZenohReply(channel, self)
 
     def cancel(self) -> None:
         self._token.cancel()  # type: ignore[no-untyped-call]  # missing in zenoh's stub
 
 
 class _ZenohReply(PendingReply):
-    def __init__(
-        self, channel: zenoh.handlers.Handler[zenoh.Reply], key: str, timeout: float
-    ) -> None:
+    """Holds its caller: a querier that is dropped takes its queries with it."""
+
+    def __init__(self, channel: zenoh.handlers.Handler[zenoh.Reply], caller: _ZenohCaller) -> None:
         self._channel = channel
-        self._key = key
-        self._timeout = timeout
+        self._caller = caller
 
     def result(self) -> bytes:
         try:
@@ -227,8 +226,8 @@ class _ZenohReply(PendingReply):
             return reply.ok.payload.to_bytes()
         payload = b"" if reply.err is None else reply.err.payload.to_bytes()
         if payload == _TIMEOUT_PAYLOAD:
-            raise DeadlineError(f"no reply within {self._timeout:g} s")
-        raise SlaveLostError(f"{self._key} answered {payload[:200]!r}")
+            raise DeadlineError(f"no reply within {self._caller.timeout:g} s")
+        raise SlaveLostError(f"{self._caller.key} answered {payload[:200]!r}")
 
 
 @contextmanager

@@ -26,9 +26,22 @@ from protocol.calls import (
     Terminate,
 )
 from protocol.errors import DoublestepError, FatalSlaveError, LifeCycleError, SlaveError
-from protocol.life_cycle import LIFE_CYCLE, LifeCycleState, next_state
+from protocol.life_cycle import LIFE_CYCLE, LifeCycleState, refusal
 from protocol.slave import Slave, SlaveDescription, StepStatus
 from slave_node.snapshots import SnapshotStore
+
+
+_OK = StepStatus.OK
+
+
+class _Mode:
+    """A life-cycle state with what to run for each call that it allows, and where that leads."""
+
+    __slots__ = ("allowed", "state")
+
+    def __init__(self, state: LifeCycleState) -> None:
+        self.state = state
+        self.allowed: dict[type[Call], tuple[Callable[[Any], object], _Mode]] = {}
 
 
 class Executor:
@@ -41,22 +54,30 @@ class Executor:
     def __init__(self, slave: Slave) -> None:
         self._slave = slave
         self._snapshots = SnapshotStore(slave)
-        self._state = LifeCycleState.INSTANTIATED
-        self._run: Mapping[type[Call], Callable[[Any], object]] = {
+        save, restore = self._snapshots.save, self._snapshots.restore
+        set_inputs, do_step, get_outputs = slave.set_inputs, slave.do_step, slave.get_outputs
+        run: Mapping[type[Call], Callable[[Any], object]] = {
             Describe: lambda _: slave.description,
             Initialize: self._initialize,
             ExitInitializationMode: lambda _: slave.exit_initialization_mode(),
-            SetInputs: lambda call: slave.set_inputs(call.derivatives),
-            DoStep: self._do_step,
-            GetOutputs: lambda call: slave.get_outputs(call.order),
-            GetState: lambda call: self._snapshots.save(call.state),
-            SetState: lambda call: self._snapshots.restore(call.state),
+            SetInputs: lambda call: set_inputs(call.derivatives),
+            DoStep: lambda call: do_step(
+                call.communication_point, call.step_size, call.no_set_state_prior
+            ),
+            GetOutputs: lambda call: get_outputs(call.order),
+            GetState: lambda call: save(call.state),
+            SetState: lambda call: restore(call.state),
             FreeState: lambda call: self._snapshots.free(call.state),
             SerializeState: lambda call: self._snapshots.serialize(call.state),
             DeserializeState: lambda call: self._snapshots.deserialize(call.state, call.data),
             Terminate: lambda _: slave.terminate(),
             Reset: self._reset,
         }
+        self._modes = {state: _Mode(state) for state in LifeCycleState}
+        for state, following in LIFE_CYCLE.items():
+            for kind, after in following.items():
+                self._modes[state].allowed[kind] = (run[kind], self._modes[after])
+        self._mode = self._modes[LifeCycleState.INSTANTIATED]
 
     @property
     def description(self) -> SlaveDescription:
@@ -66,7 +87,7 @@ class Executor:
     @property
     def state(self) -> LifeCycleState:
         """Where the slave stands in its life cycle."""
-        return self._state
+        return self._mode.state
 
     @property
     def saved_states(self) -> int:
@@ -77,28 +98,27 @@ class Executor:
         """Run the calls in order until one fails or a step is not ``ok``."""
         begin = perf_counter()
         results: list[object] = []
-        error: DoublestepError | None = None
-        run = self._run
-        for call in calls:
-            kind = type(call)
-            following = LIFE_CYCLE[self._state].get(kind)
-            try:
-                if following is None:
-                    next_state(self._state, kind)  # raises, with the words for it
-                result = run[kind](call)
-            except Exception as exception:
-                error = self._failed(call, exception)
-                break
-            results.append(result)
-            if kind is DoStep and result.status is not StepStatus.OK:  # type: ignore[attr-defined]
-                self._state = LifeCycleState.STEP_FAILED
-                break
-            self._state = following  # type: ignore[assignment]
-        return Reply(results, error, perf_counter() - begin)
+        mode = self._mode
+        try:
+            for call in calls:
+                run, following = mode.allowed[type(call)]
+                result = run(call)
+                results.append(result)
+                if type(result) is StepResult and result.status is not _OK:
+                    mode = self._modes[LifeCycleState.STEP_FAILED]
+                    break
+                mode = following
+        except Exception as exception:
+            self._mode = mode
+            error = self._failed(calls[len(results)], exception)
+            return Reply(results, error, perf_counter() - begin)
+        self._mode = mode
+        return Reply(results, None, perf_counter() - begin)
 
     def close(self) -> None:
         """Free saved states and the slave, whatever they say to it. Idempotent."""
-        state, self._state = self._state, LifeCycleState.FATAL
+        state = self._mode.state
+        self._mode = self._modes[LifeCycleState.FATAL]
         if state is LifeCycleState.FATAL:
             return
         with suppress(DoublestepError):
@@ -108,7 +128,9 @@ class Executor:
         self._slave.close()
 
     def _failed(self, call: Call, exception: Exception) -> DoublestepError:
-        if isinstance(exception, DoublestepError):
+        if type(call) not in self._mode.allowed:
+            error: DoublestepError = refusal(self._mode.state, type(call))
+        elif isinstance(exception, DoublestepError):
             error = exception
         else:
             error = SlaveError(f"{type(exception).__name__}: {exception}")
@@ -116,9 +138,9 @@ class Executor:
         if isinstance(call, DoStep):
             error.located(time=call.communication_point, step_size=call.step_size)
         if isinstance(error, FatalSlaveError):
-            self._state = LifeCycleState.FATAL
+            self._mode = self._modes[LifeCycleState.FATAL]
         elif not isinstance(error, LifeCycleError):
-            self._state = LifeCycleState.ERROR
+            self._mode = self._modes[LifeCycleState.ERROR]
         return error.located(phase=call.verb)
 
     def _initialize(self, call: Initialize) -> None:
@@ -129,11 +151,6 @@ class Executor:
             start_values=call.start_values,
             inputs=call.inputs,
             outputs=call.outputs,
-        )
-
-    def _do_step(self, call: DoStep) -> StepResult:
-        return StepResult(
-            *self._slave.do_step(call.communication_point, call.step_size, call.no_set_state_prior)
         )
 
     def _reset(self, _: Reset) -> None:

@@ -9,7 +9,6 @@ from protocol.slave import CallExecutor, Slave, SlaveDescription
 from slave_node.executor import Executor
 from slave_node.model import Model, describe
 from slave_node.model_loading import load_model_class
-from slave_node.model_slave import ModelSlave
 
 
 def load_slave(model: str, base: Path, name: str, scratch: Path, *, log_all: bool = False) -> Slave:
@@ -30,6 +29,8 @@ def load_slave(model: str, base: Path, name: str, scratch: Path, *, log_all: boo
         from slave_node.fmu.fmi2 import Fmi2Slave  # noqa: PLC0415  a Python model needs no fmpy
 
         return Fmi2Slave((base / model).resolve(), scratch, name, log_all=log_all)
+    from slave_node.model_slave import ModelSlave  # noqa: PLC0415  and an FMU no scipy
+
     return ModelSlave(_model_class(model, base))
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import BDF, DOP853, RK23, RK45, Radau
 
+from protocol.calls import StepResult
 from protocol.errors import (
     ConfigurationError,
     DoublestepError,
@@ -245,7 +246,7 @@ class ModelSlave(Slave):
 
     def do_step(
         self, communication_point: float, step_size: float, no_set_state_prior: bool
-    ) -> tuple[StepStatus, float]:
+    ) -> StepResult:
         """See `Slave`. The inputs go on as the same polynomial beyond the end of the step.
 
         Raises:
@@ -265,7 +266,7 @@ class ModelSlave(Slave):
             inputs = state.inputs.shifted(reach)
         inputs.derivatives.setflags(write=False)
         self._state = ModelState(t + reach, _read_only(x), inputs, inner_step)
-        return (StepStatus.OK if reach == h else StepStatus.DISCARD), self._state.time
+        return StepResult(StepStatus.OK if reach == h else StepStatus.DISCARD, self._state.time)
 
     def _integrate(self, state: ModelState, t: float, reach: float) -> tuple[FloatArray, float]:
         """The states at t + reach, shape (n_x,), and the inner step to try next [s].

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from protocol.errors import SlaveError
 from protocol.slave import Slave
 
@@ -21,13 +23,12 @@ class SnapshotStore:
         return len(self._states)
 
     def save(self, number: int) -> None:
-        """Save the slave's state under ``number``.
+        """Save the slave's state under ``number``; what was saved under it is freed.
 
         Raises:
-            SlaveError: the number is taken, the store is full, or the slave cannot.
+            SlaveError: the store is full, or the slave cannot.
         """
-        self._check_room(number)
-        self._states[number] = self._slave.get_state()
+        self._put(number, self._slave.get_state)
 
     def restore(self, number: int) -> None:
         """Let the slave go back to the state; it stays saved."""
@@ -44,9 +45,8 @@ class SnapshotStore:
         return self._slave.serialize_state(self._get(number))
 
     def deserialize(self, number: int, data: bytes) -> None:
-        """Make the state from bytes."""
-        self._check_room(number)
-        self._states[number] = self._slave.deserialize_state(data)
+        """Make the state from bytes; otherwise as `save`."""
+        self._put(number, lambda: self._slave.deserialize_state(data))
 
     def clear(self) -> None:
         """Free all."""
@@ -61,10 +61,15 @@ class SnapshotStore:
             saved = ", ".join(map(str, sorted(self._states))) or "none"
             raise SlaveError(f"no state is saved under number {number}; saved: {saved}") from None
 
-    def _check_room(self, number: int) -> None:
-        if number in self._states:
-            raise SlaveError(f"a state is already saved under number {number}")
-        if len(self._states) >= self._limit:
+    def _put(self, number: int, make: Callable[[], object]) -> None:
+        states = self._states
+        if number in states:
+            old = states[number]
+            states[number] = make()
+            self._slave.free_state(old)
+        elif len(states) < self._limit:
+            states[number] = make()
+        else:
             raise SlaveError(
                 f"{self._limit} states are saved already", remedy="free states that are not needed"
             )

@@ -12,8 +12,13 @@ from types import ModuleType
 
 import psutil
 import pytest
+from hypothesis import settings
 
 BUILD_SCRIPT = Path(__file__).parents[1] / "examples" / "quarter_car" / "build.py"
+
+# A slow moment of the machine is no counterexample.
+settings.register_profile("doublestep", deadline=None)
+settings.load_profile("doublestep")
 
 _MARK = "DOUBLESTEP_TEST_SESSION"
 _TIME_TO_END = 3.0

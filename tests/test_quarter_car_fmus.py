@@ -7,7 +7,6 @@ polynomial input, so (x, u, u', u'', u''', 1) obeys one linear autonomous system
 from __future__ import annotations
 
 import ctypes
-import importlib.util
 import itertools
 import math
 import os
@@ -209,10 +208,10 @@ def test_declared_feed_through(descriptions: dict[str, Any], model: str) -> None
 
 
 def test_build_is_reproducible(
-    fmu_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    build_script: ModuleType, fmu_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same sources give the same bytes; what is up to date is left alone unless forced."""
-    script = load_build_script()
+    script = build_script
     fmus = script.build(tmp_path)
     contents = [fmu.read_bytes() for fmu in fmus]
     assert contents == [(fmu_dir / fmu.name).read_bytes() for fmu in fmus]
@@ -233,9 +232,11 @@ def test_build_is_reproducible(
     assert sorted(tmp_path.iterdir()) == sorted(fmus)  # nothing is left behind
 
 
-def test_build_without_a_compiler_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_build_without_a_compiler_says_so(
+    build_script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The error names what to install, or the compiler that CC names in vain."""
-    script = load_build_script()
+    script = build_script
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
     with pytest.raises(script.BuildError, match="install"):

@@ -69,7 +69,8 @@ class ErrorEstimator:
         available = (points - 1) // 2 if self.comparison is Comparison.LONG_STEP else points - 1
         return min(order, available)
 
-    def __call__(self, y: FloatArray, y_comparison: FloatArray, ratio: FloatArray) -> FloatArray:
+    @staticmethod
+    def estimate(y: FloatArray, y_comparison: FloatArray, ratio: FloatArray) -> FloatArray:
         """EST, shape (m,), unit [y]: (y - y_comparison) / (1 - p)."""
         return (y - y_comparison) / (1.0 - ratio)
 

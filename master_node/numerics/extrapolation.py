@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from math import factorial
 
 import numpy as np
 
@@ -24,32 +26,42 @@ def interpolate(nodes: Sequence[float], values: Sequence[FloatArray]) -> InputSi
         Shape (k + 1, n_u), see `InputSignal`; row 0 is ``values[0]``, bit for bit.
     """
     k = len(nodes) - 1
-    if k == 0:
-        return InputSignal(values[0][np.newaxis])
+    newest = values[0]
+    derivatives = np.empty((k + 1, newest.size))
+    derivatives[0] = newest
+    if k == 1:
+        slope = derivatives[1]
+        np.subtract(newest, values[1], slope)
+        slope /= nodes[0] - nodes[1]
+    elif k > 1:
+        _taylor(_divided_differences(nodes, values), nodes, derivatives)
+    return InputSignal(derivatives)
+
+
+def _divided_differences(nodes: Sequence[float], values: Sequence[FloatArray]) -> list[FloatArray]:
+    """Newton's coefficients [s_0], [s_0, s_1], ..., shape (n_u,) each."""
     differences = list(values)
     newton = [differences[0]]
-    for level in range(1, k + 1):
+    for level in range(1, len(nodes)):
         differences = [
-            (differences[i] - differences[i + 1]) / (nodes[i] - nodes[i + level])
-            for i in range(k + 1 - level)
+            (newer - older) / (nodes[i] - nodes[i + level])
+            for i, (newer, older) in enumerate(pairwise(differences))
         ]
         newton.append(differences[0])
-    derivatives = np.empty((k + 1, len(values[0])))
-    derivatives[0] = newton[0]
-    if k == 1:
-        derivatives[1] = newton[1]
-        return InputSignal(derivatives)
-    coefficients = [newton[k]]  # of powers of the offset, highest degree last
+    return newton
+
+
+def _taylor(newton: Sequence[FloatArray], nodes: Sequence[float], derivatives: FloatArray) -> None:
+    """Rows 1 to k of ``derivatives`` from Newton's coefficients."""
+    k = len(nodes) - 1
+    powers = [newton[k]]  # coefficients of powers of the offset
     for level in range(k - 1, -1, -1):
-        shifted = [newton[level], *coefficients]
-        for i, coefficient in enumerate(coefficients):
-            shifted[i] = shifted[i] - nodes[level] * coefficient
-        coefficients = shifted
-    factorial = 1.0
+        multiplied = [newton[level], *powers]
+        for i, coefficient in enumerate(powers):
+            multiplied[i] = multiplied[i] - nodes[level] * coefficient
+        powers = multiplied
     for j in range(1, k + 1):
-        factorial *= j
-        derivatives[j] = coefficients[j] * factorial
-    return InputSignal(derivatives)
+        np.multiply(powers[j], factorial(j), derivatives[j])
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,12 +98,12 @@ class CouplingHistory:
 
     def signal(self, order: int) -> InputSignal:
         """u-bar: through T_n, T_(n-1), ..., T_(n-k), around T_n."""
-        return self._through(range(order + 1))
+        return self._through(slice(order + 1))
 
     def long_signal(self, order: int) -> InputSignal:
         """u-tilde: through T_n, T_(n-2), ..., T_(n-2k), around T_n, for one step of 2H."""
-        return self._through(range(0, 2 * order + 1, 2))
+        return self._through(slice(0, 2 * order + 1, 2))
 
-    def _through(self, points: range) -> InputSignal:
+    def _through(self, points: slice) -> InputSignal:
         now = self.times[0]
-        return interpolate([self.times[i] - now for i in points], [self.inputs[i] for i in points])
+        return interpolate([time - now for time in self.times[points]], self.inputs[points])

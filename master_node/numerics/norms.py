@@ -27,11 +27,18 @@ def weighted_rms_norm(
         ERR and the index j of the largest part. Anything that is not finite in ``error`` or ``y``
         gives infinity and the index of such a value: NaN never passes.
     """
-    weighted = error / (absolute_tolerance + relative_tolerance * np.abs(y))
-    square = float(weighted @ weighted)
+    weighted = np.abs(error)
+    weighted /= absolute_tolerance + relative_tolerance * np.abs(y)
+    square = weighted.dot(weighted)
     if square < np.inf:  # false for NaN too
-        return sqrt(square / len(weighted)), int(np.argmax(np.abs(weighted)))
+        return sqrt(square / len(weighted)), int(weighted.argmax())
     bad = ~(np.isfinite(weighted) & np.isfinite(y))
-    if bad.any():
-        return np.inf, int(np.argmax(bad))
-    return np.inf, int(np.argmax(np.abs(weighted)))
+    return np.inf, int(bad.argmax() if bad.any() else weighted.argmax())
+
+
+def first_not_finite(y: FloatArray) -> int | None:
+    """The index of the first NaN or infinity in ``y``, shape (m,); None when there is none."""
+    if y.dot(y) < np.inf:
+        return None
+    bad = ~np.isfinite(y)
+    return int(bad.argmax()) if bad.any() else None

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite, isnan
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class StepDecision:
+class StepDecision(NamedTuple):
     """What the controller says of an attempt.
 
     Attributes:
@@ -55,7 +55,7 @@ class StepSizeController:
         return StepDecision(error_norm <= 1.0, self.bounded(step_size * factor))
 
     def after_discard(self, step_size: float, reached: float) -> float:
-        """H after a slave got only through the part ``reached`` (0 to 1, NaN: unknown) of a step."""
+        """H after a slave completed only the part ``reached`` of a step, 0 to 1 (NaN: unknown)."""
         part = 0.0 if isnan(reached) else min(max(reached, 0.0), 1.0)
         return self.bounded(step_size * max(self.theta_min, self.alpha * part))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 from collections import deque
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from fmpy.fmi2 import (
 )
 from fmpy.logging import addLoggerProxy
 
+from protocol.calls import StepResult
 from protocol.errors import FatalSlaveError, ModelError, SlaveError, StepRejectedError
 from protocol.names import nearest
 from protocol.signals import MAX_ORDER, FloatArray
@@ -38,17 +40,38 @@ from protocol.slave import (
 )
 from slave_node.fmu.archive import check_binary, extract
 from slave_node.fmu.description import describe, read_description
+from slave_node.fmu.exchange import DERIVATIVES_CALL, VALUES_CALL, ExchangeBuffer
 
 _OK, _WARNING, _DISCARD, _ERROR, _FATAL = range(5)
 _STATUS = ("fmi2OK", "fmi2Warning", "fmi2Discard", "fmi2Error", "fmi2Fatal", "fmi2Pending")
+_STEP_OK = StepStatus.OK
 _LAST_SUCCESSFUL_TIME = 2
 _TERMINATED = 3
 _LOG_LINES = 20
 _ERROR_CATEGORIES = {"logStatusWarning", "logStatusDiscard", "logStatusError", "logStatusFatal"}
 
 _ADDRESS = ctypes.c_void_p
-_ARRAY_CALL = [_ADDRESS, _ADDRESS, ctypes.c_size_t, _ADDRESS]
-_DERIVATIVE_CALL = [_ADDRESS, _ADDRESS, ctypes.c_size_t, _ADDRESS, _ADDRESS]
+
+
+_logs: dict[int, deque[str]] = {}
+"""The last messages of each FMU, by the componentEnvironment that it was given."""
+
+
+def _log_message(
+    environment: int | None, _name: bytes, _status: int, category: bytes, text: bytes
+) -> None:
+    log = _logs.get(environment or 0)
+    if log is None and len(_logs) == 1:  # an FMU that forgets its environment
+        (log,) = _logs.values()
+    if log is not None:
+        log.append(
+            f"[{(category or b'').decode(errors='replace')}] "
+            f"{(text or b'').decode(errors='replace').strip()}"
+        )
+
+
+_LOGGER = fmi2CallbackLoggerTYPE(_log_message)
+"""One for all and for ever: the proxy of fmpy that formats the messages knows one logger."""
 
 
 class Fmi2Slave(Slave):
@@ -71,7 +94,7 @@ class Fmi2Slave(Slave):
         check_binary(fmu, directory, identifier)
         self.description: SlaveDescription = describe(fmu, model_description)
         can = self.description.capabilities
-        self._can_interpolate = can.can_interpolate_inputs
+        self._max_rows = MAX_ORDER + 1 if can.can_interpolate_inputs else 1
         self._max_order = min(can.max_output_derivative_order, MAX_ORDER)
         self._references = {v.name: v.valueReference for v in model_description.modelVariables}
         self._log: deque[str] = deque(maxlen=_LOG_LINES)
@@ -96,23 +119,19 @@ class Fmi2Slave(Slave):
         names = [category.name for category in categories]
         wanted = [n for n in names if log_all or n in _ERROR_CATEGORIES]
         callbacks = fmi2CallbackFunctions()
-        callbacks.logger = fmi2CallbackLoggerTYPE(self._logged)
+        callbacks.logger = _LOGGER
+        callbacks.componentEnvironment = id(self._log)
         callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
         callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
         addLoggerProxy(ctypes.byref(callbacks))
         assert self._fmu is not None
+        _logs[id(self._log)] = self._log
         try:
             self._fmu.instantiate(callbacks=callbacks, loggingOn=log_all or bool(wanted))
             if wanted:
                 self._fmu.setDebugLogging(True, wanted)
         except Exception as error:  # as above
             raise ModelError(self._with_log(f"{fmu}: fmi2Instantiate: {error}")) from error
-
-    def _logged(self, _env: Any, _name: bytes, _status: int, category: bytes, text: bytes) -> None:
-        self._log.append(
-            f"[{(category or b'').decode(errors='replace')}] "
-            f"{(text or b'').decode(errors='replace').strip()}"
-        )
 
     def _with_log(self, text: str) -> str:
         lines = " | ".join(list(self._log)[-5:])
@@ -130,38 +149,27 @@ class Fmi2Slave(Slave):
             return function
 
         self._component = component
-        self._set_real = load("fmi2SetReal", _ARRAY_CALL)
-        self._get_real = load("fmi2GetReal", _ARRAY_CALL)
-        self._set_derivatives = load("fmi2SetRealInputDerivatives", _DERIVATIVE_CALL)
-        self._get_derivatives = load("fmi2GetRealOutputDerivatives", _DERIVATIVE_CALL)
+        self._set_real = load("fmi2SetReal", VALUES_CALL)
+        self._get_real = load("fmi2GetReal", VALUES_CALL)
+        self._set_derivatives = load("fmi2SetRealInputDerivatives", DERIVATIVES_CALL)
+        self._get_derivatives = load("fmi2GetRealOutputDerivatives", DERIVATIVES_CALL)
         double, integer = ctypes.c_double, ctypes.c_int
-        self._do_step = load("fmi2DoStep", [_ADDRESS, double, double, integer])
-        if self.description.capabilities.can_get_and_set_state:
-            self._get_state = load("fmi2GetFMUstate", [_ADDRESS, _ADDRESS])
-            self._set_state = load("fmi2SetFMUstate", [_ADDRESS, _ADDRESS])
-            self._free_state = load("fmi2FreeFMUstate", [_ADDRESS, _ADDRESS])
+        self._do_step = partial(load("fmi2DoStep", [_ADDRESS, double, double, integer]), component)
+        self._saves_state = self.description.capabilities.can_get_and_set_state
+        if self._saves_state:
+            self._get_state = partial(load("fmi2GetFMUstate", [_ADDRESS, _ADDRESS]), component)
+            self._set_state = partial(load("fmi2SetFMUstate", [_ADDRESS, _ADDRESS]), component)
+            self._free_state = partial(load("fmi2FreeFMUstate", [_ADDRESS, _ADDRESS]), component)
 
     def _bind(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
         """Make the buffers for these inputs and outputs."""
-        n_u, n_y = len(inputs), len(outputs)
         self._rows_set = 1
-        self._n_inputs, self._n_outputs = n_u, n_y
-        self._u = np.zeros((MAX_ORDER + 1, n_u))
-        self._y = np.zeros((MAX_ORDER + 1, n_y))
-        u_references = self._reference_array(inputs)
-        y_references = self._reference_array(outputs)
-        self._u_references = np.tile(u_references, MAX_ORDER)
-        self._y_references = np.tile(y_references, MAX_ORDER)
-        self._u_orders = np.repeat(np.arange(1, MAX_ORDER + 1, dtype=np.int32), n_u)
-        self._y_orders = np.repeat(np.arange(1, MAX_ORDER + 1, dtype=np.int32), n_y)
-        self._u_address = self._u.ctypes.data
-        self._u_rows_address = self._u[1:].ctypes.data
-        self._y_address = self._y.ctypes.data
-        self._y_rows_address = self._y[1:].ctypes.data
-        self._u_references_address = self._u_references.ctypes.data
-        self._y_references_address = self._y_references.ctypes.data
-        self._u_orders_address = self._u_orders.ctypes.data
-        self._y_orders_address = self._y_orders.ctypes.data
+        self._inputs = ExchangeBuffer(
+            self._component, self._reference_array(inputs), self._set_real, self._set_derivatives
+        )
+        self._outputs = ExchangeBuffer(
+            self._component, self._reference_array(outputs), self._get_real, self._get_derivatives
+        )
 
     def _reference_array(self, names: Sequence[str]) -> np.ndarray[Any, np.dtype[np.uint32]]:
         for name in names:
@@ -227,39 +235,36 @@ class Fmi2Slave(Slave):
             self._check(error.function, error.status)
 
     def set_inputs(self, derivatives: FloatArray) -> None:
-        """See `Slave`."""
-        n = self._n_inputs
+        """See `Slave`. A derivative once set stays set, so those above the order are zeroed."""
+        inputs = self._inputs
         rows, columns = derivatives.shape
-        if columns != n:
-            raise SlaveError(f"{columns} input values for {n} inputs")
-        if n == 0:
+        if columns != inputs.size or rows > self._max_rows:
+            raise SlaveError(
+                f"{rows} rows of {columns} input values; it takes up to {self._max_rows} rows of "
+                f"values for {inputs.size} inputs"
+            )
+        if columns == 0:
             return
-        self._u[:rows] = derivatives
-        # A derivative that was set stays set: those above the present order are set to zero.
-        self._rows_set = max(self._rows_set, rows)
-        self._u[rows : self._rows_set] = 0.0
-        status = self._set_real(self._component, self._u_references_address, n, self._u_address)
+        if rows < self._rows_set:
+            inputs.rows[rows:] = 0.0
+        else:
+            self._rows_set = rows
+        inputs.first[rows][...] = derivatives
+        status = inputs.transfer_values()
         if status:
             self._check("fmi2SetReal", status)
         if self._rows_set > 1:
-            self._require(self._can_interpolate, "take derivatives of inputs")
-            status = self._set_derivatives(
-                self._component,
-                self._u_references_address,
-                (self._rows_set - 1) * n,
-                self._u_orders_address,
-                self._u_rows_address,
-            )
+            status = inputs.transfer_derivatives[self._rows_set - 1]()
             if status:
                 self._check("fmi2SetRealInputDerivatives", status)
 
     def do_step(
         self, communication_point: float, step_size: float, no_set_state_prior: bool
-    ) -> tuple[StepStatus, float]:
+    ) -> StepResult:
         """See `Slave`."""
-        status = self._do_step(self._component, communication_point, step_size, no_set_state_prior)
-        if status in (_OK, _WARNING):
-            return StepStatus.OK, communication_point + step_size
+        status = self._do_step(communication_point, step_size, no_set_state_prior)
+        if status <= _WARNING:
+            return StepResult(_STEP_OK, communication_point + step_size)
         if status == _DISCARD:
             return self._discarded()
         if status == _ERROR:
@@ -267,7 +272,7 @@ class Fmi2Slave(Slave):
         self._check("fmi2DoStep", status)
         raise AssertionError
 
-    def _discarded(self) -> tuple[StepStatus, float]:
+    def _discarded(self) -> StepResult:
         assert self._fmu is not None
         time = ctypes.c_double(float("nan"))
         terminated = ctypes.c_int(0)
@@ -279,50 +284,46 @@ class Fmi2Slave(Slave):
             self._fmu.fmi2GetBooleanStatus(self._component, _TERMINATED, ctypes.byref(terminated))
         except (FMICallException, AttributeError, KeyError):
             terminated.value = 0
-        return (StepStatus.TERMINATED if terminated.value else StepStatus.DISCARD), time.value
+        status = StepStatus.TERMINATED if terminated.value else StepStatus.DISCARD
+        return StepResult(status, time.value)
 
     def get_outputs(self, order: int) -> FloatArray:
         """See `Slave`."""
-        n = self._n_outputs
         if not 0 <= order <= self._max_order:
             raise SlaveError(
                 f"output derivatives of order {order} asked for; it gives orders up to "
                 f"{self._max_order}"
             )
-        if n:
-            status = self._get_real(self._component, self._y_references_address, n, self._y_address)
+        outputs = self._outputs
+        if outputs.size:
+            status = outputs.transfer_values()
             if status:
                 self._check("fmi2GetReal", status)
             if order:
-                status = self._get_derivatives(
-                    self._component,
-                    self._y_references_address,
-                    order * n,
-                    self._y_orders_address,
-                    self._y_rows_address,
-                )
+                status = outputs.transfer_derivatives[order]()
                 if status:
                     self._check("fmi2GetRealOutputDerivatives", status)
-        return self._y[: order + 1].copy()
+        return outputs.first[order + 1].copy()
 
     def get_state(self) -> object:
         """See `Slave`."""
-        self._require(self.description.capabilities.can_get_and_set_state, "save its state")
+        if not self._saves_state:
+            raise SlaveError(f"the FMU {self.description.model} cannot save its state")
         state = ctypes.c_void_p()
-        status = self._get_state(self._component, ctypes.byref(state))
+        status = self._get_state(ctypes.byref(state))
         if status:
             self._check("fmi2GetFMUstate", status)
         return state
 
     def set_state(self, state: object) -> None:
         """See `Slave`."""
-        status = self._set_state(self._component, state)
+        status = self._set_state(state)
         if status:
             self._check("fmi2SetFMUstate", status)
 
     def free_state(self, state: object) -> None:
         """See `Slave`."""
-        status = self._free_state(self._component, ctypes.byref(state))  # type: ignore[arg-type]
+        status = self._free_state(ctypes.byref(state))  # type: ignore[arg-type]
         if status:
             self._check("fmi2FreeFMUstate", status)
 
@@ -371,6 +372,7 @@ class Fmi2Slave(Slave):
         if self._fmu is not None:
             fmu, self._fmu = self._fmu, None
             fmu.freeInstance()
+            _logs.pop(id(self._log), None)
 
 
 def settable_variable(description: SlaveDescription, name: str) -> Variable:
