@@ -42,7 +42,9 @@ class HandWritten:
         slave.enterInitializationMode()
         slave.exitInitializationMode()
         references = {
-            causality: [v.valueReference for v in description.modelVariables if v.causality == causality]
+            causality: [
+                v.valueReference for v in description.modelVariables if v.causality == causality
+            ]
             for causality in ("input", "output")
         }
         return slave, references["input"], references["output"]
@@ -54,14 +56,14 @@ class HandWritten:
         middle, states = [], []
         for i, (slave, inputs, outputs) in enumerate(self._slaves):
             u = y1[1 - i]
-            du = [(a - b) / h for a, b in zip(u, y0[1 - i])]
+            du = [(a - b) / h for a, b in zip(u, y0[1 - i], strict=True)]
             state = slave.getFMUstate()
             slave.setReal(inputs, u)
             slave.setRealInputDerivatives(inputs, [1, 1], du)
             slave.doStep(t, h)
             middle.append(slave.getReal(outputs))
             halfway = slave.getFMUstate()
-            slave.setReal(inputs, [a + h * b for a, b in zip(u, du)])
+            slave.setReal(inputs, [a + h * b for a, b in zip(u, du, strict=True)])
             slave.setRealInputDerivatives(inputs, [1, 1], du)
             slave.doStep(t + h, h)
             slave.getReal(outputs)
@@ -71,7 +73,7 @@ class HandWritten:
         end = []
         for i, (slave, inputs, outputs) in enumerate(self._slaves):
             u = middle[1 - i]
-            du = [(a - b) / h for a, b in zip(u, y1[1 - i])]
+            du = [(a - b) / h for a, b in zip(u, y1[1 - i], strict=True)]
             slave.setReal(inputs, u)
             slave.setRealInputDerivatives(inputs, [1, 1], du)
             slave.doStep(t + h, h)

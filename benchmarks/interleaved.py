@@ -7,7 +7,7 @@ import numpy as np
 
 from master_node.observers import Attempt, RunEnd, RunStart
 
-BLOCK = 50
+BLOCK = 1
 
 
 class Interleaved:

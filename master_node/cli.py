@@ -17,6 +17,7 @@ app = typer.Typer(
     help="Co-simulation master with error-controlled communication step sizes.",
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 
@@ -24,7 +25,7 @@ ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
 
 
 @app.command()
-def run(
+def run(  # noqa: PLR0917  options of the command line
     system_file: Annotated[Path, typer.Argument(metavar="SYSTEM.toml", help="What to run.")],
     output: Annotated[Path, typer.Option(help="Directory for the results.")] = Path("results"),
     order: Annotated[
@@ -47,7 +48,7 @@ def run(
         bool, typer.Option("--no-launch", help="Start no slaves: find all of them on the bus.")
     ] = False,
     connect: Annotated[
-        list[str] | None, typer.Option(help="Router or slave to connect to, tcp/HOST:PORT.")
+        list[str] | None, typer.Option(help="Slave to connect to, tcp/HOST:PORT.")
     ] = None,
     listen: Annotated[
         list[str] | None, typer.Option(help="Where slaves can connect, tcp/HOST:PORT.")
@@ -61,7 +62,7 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
 ) -> None:
-    """Run the system of SYSTEM.toml and write results.csv, steps.csv, summary.json and results.png."""
+    """Run SYSTEM.toml and write results.csv, steps.csv, summary.json and results.png."""
     from rich.console import Console  # noqa: PLC0415  each command imports what it needs
 
     from master_node.configuration import load_system  # noqa: PLC0415

@@ -12,11 +12,14 @@ import numpy as np
 
 from master_node.configuration import SimulationSettings, System
 from master_node.double_step import DoubleStep, DoubleStepper, FailedStep
+from master_node.error_control import ErrorControl, Verdict
 from master_node.initialization import gather, initialize
 from master_node.numerics.error_estimators import ESTIMATORS, ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory
-from master_node.numerics.norms import weighted_rms_norm
-from master_node.numerics.step_size_controller import StepSizeController, last_step_size
+from master_node.numerics.step_size_controller import (
+    fixed_steps,
+    last_step_size,
+)
 from master_node.observers import Attempt, Observer, Outcome, RunEnd, RunStart, Statistics
 from master_node.slave_group import Program, SlaveGroup
 from master_node.system import CoupledSystem
@@ -33,6 +36,9 @@ from protocol.slave import StepStatus
 
 _NAN = float("nan")
 _INF = float("inf")
+
+Points = tuple[tuple[float, FloatArray], ...]
+"""Communication points reached and the outputs there, shape (m,) each."""
 
 
 def effective_orders(coupled: CoupledSystem, order: int) -> tuple[int, ...]:
@@ -113,7 +119,8 @@ class CoSimulation:
         outcome, message = Outcome.FAILED, ""
         try:
             try:
-                note = self._steps(y, statistics)
+                with np.errstate(over="ignore", invalid="ignore"):  # the norm finds them
+                    note = self._steps(y, statistics)
             finally:
                 statistics.wall_time = perf_counter() - begin
                 statistics.round_trips = self.group.round_trips
@@ -147,74 +154,48 @@ class CoSimulation:
         self, y: FloatArray, statistics: Statistics, estimator: ErrorEstimator
     ) -> str:
         settings, coupled = self.system.simulation, self.coupled
-        stop = settings.end
-        controller = StepSizeController(
-            settings.alpha,
-            settings.theta_min,
-            settings.theta_max,
-            settings.smallest,
-            settings.largest,
-        )
-        orders = effective_orders(coupled, settings.order)
+        stop, largest_order = settings.end, settings.order
+        orders = effective_orders(coupled, largest_order)
+        control = ErrorControl(coupled, settings, estimator, orders)
         stepper = DoubleStepper(self.group, coupled, estimator, orders)
-        history = self._first_history(y, estimator.points(settings.order))
-        ratios = [
-            estimator.ratio(np.minimum(np.array(orders), k)[coupled.output_slave])
-            for k in range(settings.order + 1)
-        ]
-        lowest_order = min(orders)
-        step_size = settings.step_size
-        errors_in_a_row = 0
+        history = self._first_history(y, estimator.points(largest_order))
+        step_size, errors_in_a_row = settings.step_size, 0
         while (time := history.times[0]) < stop:
             h = last_step_size(time, stop, step_size)
             is_last = 2.0 * h >= stop - time
-            order = estimator.order(settings.order, len(history.times))
-            solution = stepper.attempt(history, h, order, stop if is_last else None)
-            if isinstance(solution, DoubleStep):
-                error = estimator.estimate(solution.y, solution.y_comparison, ratios[order])
-                norm, worst = weighted_rms_norm(
-                    error, solution.y, coupled.absolute_tolerance, coupled.relative_tolerance
+            order = estimator.order(largest_order, len(history.times))
+            attempt = stepper.attempt(history, h, order, stop if is_last else None)
+            verdict = control.judge(attempt, h, order)
+            if isinstance(attempt, DoubleStep) and verdict.accepted:
+                stepper.accepted()
+                history = attempt.history.pushed(attempt.end, attempt.y[coupled.source])
+                points = ((attempt.middle, attempt.y_middle), (attempt.end, attempt.y))
+                _accept(statistics, h, points)
+                self._tell(time, h, order, verdict, points)
+                step_size = (
+                    verdict.step_size if h == step_size else max(step_size, verdict.step_size)
                 )
-                exponent = min(lowest_order, order) + (1 if coupled.has_feed_through else 2)
-                decision = controller.decide(h, norm, exponent)
-                limiting = coupled.output_names[worst]
-                following = decision.step_size
-                if decision.accepted:
-                    errors_in_a_row = 0
-                    stepper.accepted()
-                    history = solution.history.pushed(solution.end, solution.y[coupled.source])
-                    self._accept(statistics, h, 2, solution.end)
-                    self.observer.attempted(
-                        Attempt(
-                            time,
-                            h,
-                            order,
-                            norm,
-                            True,
-                            limiting,
-                            ((solution.middle, solution.y_middle), (solution.end, solution.y)),
-                        )
-                    )
-                    step_size = following if h == step_size else max(following, step_size)
-                    continue
-                if norm == _INF and not np.isfinite(solution.y).all():
-                    limiting += " is not finite"
-            else:
-                norm, limiting = _INF, solution.reason
-                if solution.status is StepStatus.TERMINATED:
-                    return f"{solution.slave} ended the simulation after t={time!r} s"
-                if solution.error is not None:
-                    errors_in_a_row += 1
-                    if errors_in_a_row > 1:
-                        raise solution.error
-                following = controller.after_discard(h, solution.reached)
+                errors_in_a_row = 0
+                continue
+            if isinstance(attempt, FailedStep):
+                if attempt.status is StepStatus.TERMINATED:
+                    return f"{attempt.slave} ended the simulation after t={time!r} s"
+                errors_in_a_row += attempt.error is not None
+                if attempt.error is not None and errors_in_a_row > 1:
+                    raise attempt.error
             stepper.rejected()
             statistics.rejected_double_steps += 1
-            self.observer.attempted(Attempt(time, h, order, norm, False, limiting))
+            self._tell(time, h, order, verdict, ())
             if h <= settings.smallest:
-                raise self._stuck(solution, time, h, norm, limiting)
-            step_size = following
+                raise _stuck(attempt, time, h, verdict)
+            step_size = verdict.step_size
         return ""
+
+    def _tell(
+        self, time: float, step_size: float, order: int, verdict: Verdict, points: Points
+    ) -> None:
+        accepted, _, norm, limiting = verdict
+        self.observer.attempted(Attempt(time, step_size, order, norm, accepted, limiting, points))
 
     def _first_history(self, y: FloatArray, depth: int) -> CouplingHistory:
         settings = self.system.simulation
@@ -222,29 +203,6 @@ class CoSimulation:
         if settings.initial_history == "rest":
             return CouplingHistory.at_rest(start, u, depth, settings.step_size)
         return CouplingHistory.start(start, u, depth)
-
-    def _stuck(
-        self, solution: DoubleStep | FailedStep, time: float, h: float, norm: float, limiting: str
-    ) -> DoublestepError:
-        if isinstance(solution, FailedStep) and solution.error is not None:
-            return solution.error
-        reason = f"ERR = {norm:.3g}, most of it from {limiting}" if norm < _INF else limiting
-        return StepSizeError(
-            f"rejected at the smallest communication step size: {reason}",
-            phase="double step",
-            time=time,
-            step_size=h,
-            remedy="raise the tolerances or lower smallest_step_size",
-        )
-
-    @staticmethod
-    def _accept(statistics: Statistics, h: float, steps: int, time: float) -> None:
-        statistics.communication_steps += steps
-        statistics.time = time
-        if not h >= statistics.smallest_step_size:
-            statistics.smallest_step_size = h
-        if not h <= statistics.largest_step_size:
-            statistics.largest_step_size = h
 
     # --- without: a fixed step, one round trip each ----------------------------------------------
 
@@ -255,10 +213,10 @@ class CoSimulation:
         orders = effective_orders(coupled, settings.order)
         history = self._first_history(y, settings.order + 1)
         names = coupled.output_names
-        n = 0
-        while (time := history.times[0]) < stop:
-            n += 1
-            end = min(start + n * h, stop)
+        last = fixed_steps(start, stop, h)
+        for n in range(1, last + 1):
+            time = history.times[0]
+            end = start + n * h if n < last else stop
             order = min(settings.order, len(history.times) - 1)
             d = history.signal(order).derivatives
             step, get = DoStep(time, end - time, True), GetOutputs()
@@ -295,6 +253,33 @@ class CoSimulation:
                     remedy="lower --step-size, or use an estimator, which repeats such steps",
                 )
             history = history.pushed(end, y[coupled.source])
-            self._accept(statistics, end - time, 1, end)
+            _accept(statistics, end - time, ((end, y),))
             self.observer.attempted(Attempt(time, end - time, order, _NAN, True, "", ((end, y),)))
         return ""
+
+
+def _accept(statistics: Statistics, step_size: float, points: Points) -> None:
+    statistics.communication_steps += len(points)
+    statistics.time = points[-1][0]
+    if not step_size >= statistics.smallest_step_size:
+        statistics.smallest_step_size = step_size
+    if not step_size <= statistics.largest_step_size:
+        statistics.largest_step_size = step_size
+
+
+def _stuck(
+    attempt: DoubleStep | FailedStep, time: float, step_size: float, verdict: Verdict
+) -> DoublestepError:
+    """The error for a rejection at the smallest communication step size."""
+    if isinstance(attempt, FailedStep) and attempt.error is not None:
+        return attempt.error
+    reason = verdict.limiting_variable
+    if verdict.error_norm < _INF:
+        reason = f"ERR = {verdict.error_norm:.3g}, most of it from {reason}"
+    return StepSizeError(
+        f"rejected at the smallest communication step size: {reason}",
+        phase="double step",
+        time=time,
+        step_size=step_size,
+        remedy="raise the tolerances or lower smallest_step_size",
+    )

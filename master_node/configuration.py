@@ -39,9 +39,17 @@ def _finite(value: float) -> float:
     return value
 
 
+def _reference(value: str) -> str:
+    slave, dot, variable = value.partition(".")
+    if not (slave and dot and variable):
+        raise ValueError("write slave.variable")
+    return value
+
+
 Number = Annotated[StrictFloat, AfterValidator(_finite)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
+Reference = Annotated[StrictStr, AfterValidator(_reference)]
 Value = StrictBool | StrictInt | StrictFloat | StrictStr
 
 
@@ -54,8 +62,8 @@ class SimulationSettings(_Table):
 
     Attributes:
         start_time, stop_time: [s].
-        initial_step_size: H_0 [s]; default: a thousandth of the simulated time. With estimator
-            ``none`` it is the step size of the whole run.
+        initial_step_size: H_0 [s]; default: a thousandth of the simulated time, within the bounds
+            of H. With estimator ``none`` it is the step size of the whole run.
         order: degree k of the input polynomials.
         estimator: EST_Rich, EST_mod or none (a fixed step).
         relative_tolerance, absolute_tolerance: RTOL and ATOL of equation (8) for all outputs;
@@ -99,12 +107,16 @@ class SimulationSettings(_Table):
             raise ValueError(
                 f"stop_time {self.stop_time:g} must be after start_time {self.start_time:g}"
             )
-        smallest, initial, largest = self.smallest, self.step_size, self.largest
-        if not smallest <= initial:
+        smallest, initial, largest = self.smallest, self.step_size, self.largest_step_size
+        if largest is not None and smallest > largest:
+            raise ValueError(
+                f"smallest_step_size {smallest:g} is above largest_step_size {largest:g}"
+            )
+        if initial < smallest:
             raise ValueError(
                 f"initial_step_size {initial:g} is below smallest_step_size {smallest:g}"
             )
-        if self.largest_step_size is not None and initial > largest:
+        if largest is not None and initial > largest:
             raise ValueError(
                 f"initial_step_size {initial:g} is above largest_step_size {largest:g}"
             )
@@ -126,7 +138,10 @@ class SimulationSettings(_Table):
     @property
     def step_size(self) -> float:
         """H_0 [s]."""
-        return float(self.initial_step_size or (self.end - self.start_time) * 1e-3)
+        if self.initial_step_size is not None:
+            return float(self.initial_step_size)
+        default = max((self.end - self.start_time) * 1e-3, self.smallest_step_size or 0.0)
+        return float(min(default, self.largest_step_size or default))
 
     @property
     def smallest(self) -> float:
@@ -178,8 +193,8 @@ class Connection(_Table):
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
-    source: StrictStr = Field(alias="from")
-    target: StrictStr = Field(alias="to")
+    source: Reference = Field(alias="from")
+    target: Reference = Field(alias="to")
 
     @model_validator(mode="before")
     @classmethod
@@ -238,6 +253,18 @@ class System(_Table):
                 check_name(name)
             except ConfigurationError as error:
                 raise ValueError(str(error)) from None
+        return self
+
+    def checked(self) -> Self:
+        """The system itself, as nothing more can be added to it.
+
+        Raises:
+            ConfigurationError: something is still missing.
+        """
+        try:
+            _ = self.simulation.end
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{self.source}: {error.cause}", remedy=error.remedy) from None
         return self
 
     def with_simulation(self, **settings: Any) -> System:
@@ -300,7 +327,7 @@ def _sentence(detail: ErrorDetails) -> str:
     if kind == "missing":
         *tables, key = place
         return f"{_table(tables)}key {key!r} is missing"
-    message = detail["msg"].removeprefix("Value error, ")
+    message = _WORDS.get(kind, detail["msg"].removeprefix("Value error, "))
     message = message[:1].lower() + message[1:]
     if len(place) > 2 and place[2] == "parameters":
         message = "must be a number, a boolean or a string"
@@ -312,6 +339,11 @@ def _sentence(detail: ErrorDetails) -> str:
     return f"{_table(tables)}{key} = {detail['input']!r:.60}: {message}"
 
 
+_WORDS = {
+    "model_type": "must be a table",
+    "mapping_type": "must be a table",
+    "tuple_type": "must be an array",
+}
 _UNION_BRANCHES = frozenset({"float", "int", "bool", "str", "constrained-float", "constrained-int"})
 
 

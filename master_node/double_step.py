@@ -217,8 +217,8 @@ class DoubleStepper:
         request = self._first_request
         signal_1, signal_2, program = request(history, order, step_size, second)
         d_1, d_2 = signal_1.derivatives, signal_2.derivatives
-        programs = [
-            (self._first_call, *program(d_1[:rows, part], d_2[:rows, part]))
+        programs = [  # a slave that gets a constant goes on with it in the comparison solution
+            (self._first_call, *program(d_1[:rows, part], (d_2 if rows > 1 else d_1)[:rows, part]))
             for part, rows in zip(self._slices, self._rows, strict=True)
         ]
         replies = self._group.execute(programs, time, step_size)

@@ -1,4 +1,4 @@
-"""Puts a run together: slaves, connections, observers, algorithm. Used by the command and `simulate`."""
+"""Puts a run together: slaves, connections, observers and the algorithm."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _slaves(
 
 def settings_of(system: System, descriptions: Mapping[str, SlaveDescription]) -> dict[str, object]:
     """All settings of a run as plain data, with the hashes of the models, for ``summary.json``."""
-    settings = system.model_dump(mode="json", by_alias=True)
+    settings = system.checked().model_dump(mode="json", by_alias=True)
     simulation = system.simulation
     settings["simulation"] |= {
         "initial_step_size": simulation.step_size,

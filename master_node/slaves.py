@@ -156,7 +156,12 @@ def _endpoints(system: System, private: str, *, launched: bool, found: bool) -> 
         listen.append(DEFAULT_ENDPOINT)
     if launched:
         listen.append(private)
-    return Endpoints(tuple(listen), tuple(system.bus.connect), system.bus.insecure)
+    try:
+        return Endpoints(tuple(listen), tuple(system.bus.connect), system.bus.insecure)
+    except ConfigurationError as error:
+        raise ConfigurationError(
+            f"{system.source}: [bus] {error.cause}", remedy=error.remedy
+        ) from None
 
 
 def _free_port() -> int:

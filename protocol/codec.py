@@ -2,13 +2,20 @@
 
 ::
 
-    request  [version, epoch, sequence, program]      program: the bytes of [call, call, ...]
-    call     [verb, field, field, ...]                in the order of the dataclass's fields
-    reply    [version, [result, ...], error, compute_time]      error: nil or a map
+    request  [version, epoch, sequence, program]      program: the bytes of [shape, numbers]
+    reply    [version, shape, numbers, error, compute_time]     error: nil or a map
 
-    float64 array, shape (n,) or (rows, n)    [rows, bytes], little-endian, row by row
-    step result                               [status, time]
-    slave description, mapping                a map by field name
+    shape    the bytes of [call, call, ...] or [result, result, ...] with their numbers left out
+    numbers  all those numbers, float64, little-endian, in order
+    call     ["set_inputs", rows, columns]            numbers: rows x columns
+             ["do_step", no_set_state_prior]          numbers: communication point, step size
+             [verb, field, field, ...]                all others, no numbers left out
+    result   [rows, columns] for outputs              numbers: rows x columns
+             status for a step                        numbers: time
+             what it is, for all others               a description is a map by field name
+
+From one double step to the next only the numbers change, so a shape is parsed and checked once and
+then looked up: the hot path is one copy of a block of numbers.
 
 A single verb travels as a map of the call's fields, and its answer as a map with ``result``, so
 that any Zenoh client with a MessagePack library can drive a slave by hand (``docs/protocol.md``).
@@ -21,8 +28,10 @@ well-formed or a `MalformedMessageError`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields
-from typing import Any, Final
+from dataclasses import asdict
+from functools import lru_cache
+from struct import Struct
+from typing import Any, Final, NamedTuple
 
 import msgpack
 import numpy as np
@@ -63,6 +72,8 @@ _MAX_CONTAINERS: Final = 500_000
 _SMALL_MESSAGE: Final = 2**10
 
 _LITTLE_ENDIAN = np.dtype("<f8")
+_ONE = Struct("<d")
+_TWO = Struct("<dd")
 
 
 def _unpack(data: bytes, what: str) -> Any:
@@ -113,10 +124,6 @@ def _pack(value: Any) -> bytes:
 
 
 # --- values -------------------------------------------------------------------------------------
-
-
-def _pack_array(array: FloatArray) -> list[Any]:
-    return [len(array), array.astype(_LITTLE_ENDIAN, copy=False).tobytes()]
 
 
 def _array(value: Any, what: str) -> FloatArray:
@@ -224,15 +231,8 @@ _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
 _CALL_BY_VERB: Mapping[str, type[Call]] = {cls.verb: cls for cls in CALLS}
 
 
-def _pack_call(call: Call) -> list[Any]:
-    if type(call) is SetInputs:
-        return [call.verb, _pack_array(call.derivatives)]
-    if type(call) is DoStep:
-        return [call.verb, call.communication_point, call.step_size, call.no_set_state_prior]
-    return [call.verb, *(getattr(call, field.name) for field in fields(call))]
-
-
 def _call(value: Any) -> Call:
+    """A call of whose fields none is left out."""
     if type(value) is not list or not value or type(value[0]) is not str:
         raise MalformedMessageError(f"a call must be [verb, field, ...], not {_shown(value)}")
     verb, *arguments = value
@@ -247,9 +247,133 @@ def _call(value: Any) -> Call:
     )
 
 
+_Maker = Callable[[FloatArray], Any]
+
+
+class _Plan(NamedTuple):
+    """How to make the items of a message of one shape from its numbers.
+
+    Attributes:
+        items: those that need no numbers, None where one does.
+        made: index, maker and place in the numbers of those that do.
+        size: how many numbers there are.
+    """
+
+    items: list[Any]
+    made: list[tuple[int, _Maker, int, int]]
+    size: int
+
+    def build(self, numbers: bytes, what: str) -> list[Any]:
+        """The items; the arrays among them are read-only views of ``numbers``."""
+        if len(numbers) != 8 * self.size:
+            raise MalformedMessageError(
+                f"{what} has {len(numbers)} bytes of numbers where its shape wants {8 * self.size}"
+            )
+        block = np.frombuffer(numbers, _LITTLE_ENDIAN)
+        items = self.items.copy()
+        for index, make, begin, end in self.made:
+            items[index] = make(block[begin:end])
+        return items
+
+
+class _PlanBuilder:
+    """Collects the items of a shape in order."""
+
+    def __init__(self) -> None:
+        self._items: list[Any] = []
+        self._made: list[tuple[int, _Maker, int, int]] = []
+        self._size = 0
+
+    def add(self, item: Any) -> None:
+        """An item that needs no numbers."""
+        self._items.append(item)
+
+    def add_made(self, make: _Maker, size: int) -> None:
+        """An item that is made of the next ``size`` numbers."""
+        self._made.append((len(self._items), make, self._size, self._size + size))
+        self._items.append(None)
+        self._size += size
+
+    def plan(self) -> _Plan:
+        """What was collected."""
+        return _Plan(self._items, self._made, self._size)
+
+
+def _matrix(rows: Any, columns: Any, what: str) -> tuple[int, int]:
+    """The size of an array in a shape."""
+    if type(rows) is not int or not 1 <= rows <= MAX_ORDER + 1:
+        raise MalformedMessageError(f"{what} must have 1 to {MAX_ORDER + 1} rows")
+    if type(columns) is not int or not 0 <= columns <= MAX_COLUMNS:
+        raise MalformedMessageError(f"{what} must have 0 to {MAX_COLUMNS} columns")
+    return rows, columns
+
+
+def _cached(shape: bytes) -> bool:
+    """Whether a shape is worth keeping; those with long lists of names come once."""
+    return len(shape) <= _SMALL_MESSAGE
+
+
+_CACHED_SHAPES: Final = 256
+
+
+def _program_plan(shape: bytes) -> _Plan:
+    program = _unpack(shape, "a program")
+    if type(program) is not list or len(program) > MAX_CALLS:
+        raise MalformedMessageError(f"a program must be a list of at most {MAX_CALLS} calls")
+    builder = _PlanBuilder()
+    for item in program:
+        match item:
+            case [SetInputs.verb, rows, columns]:
+                size = _matrix(rows, columns, "inputs")
+                builder.add_made(_set_inputs_maker(size), size[0] * size[1])
+            case [DoStep.verb, no_set_state_prior]:
+                prior = _boolean(no_set_state_prior, "no_set_state_prior")
+                builder.add_made(_do_step_maker(prior), 2)
+            case [(SetInputs.verb | DoStep.verb) as verb, *_]:
+                raise MalformedMessageError("has another form in a program", phase=verb)
+            case _:
+                builder.add(_call(item))
+    return builder.plan()
+
+
+_cached_program_plan = lru_cache(_CACHED_SHAPES)(_program_plan)
+
+
+def _set_inputs_maker(size: tuple[int, int]) -> _Maker:
+    return lambda numbers: SetInputs(numbers.reshape(size))
+
+
+def _do_step_maker(no_set_state_prior: bool) -> _Maker:
+    def make(numbers: FloatArray) -> DoStep:
+        communication_point, step_size = numbers.tolist()
+        return DoStep(communication_point, step_size, no_set_state_prior)
+
+    return make
+
+
 def encode_program(calls: Sequence[Call]) -> bytes:
     """A list of calls as the ``program`` of a request."""
-    return _pack([_pack_call(call) for call in calls])
+    shape: list[Any] = []
+    numbers: list[bytes] = []
+    for call in calls:
+        kind = type(call)
+        if kind is SetInputs:
+            shape.append((SetInputs.verb, *call.derivatives.shape))  # type: ignore[union-attr]
+            numbers.append(_float_bytes(call.derivatives))  # type: ignore[union-attr]
+        elif kind is DoStep:
+            shape.append((DoStep.verb, call.no_set_state_prior))  # type: ignore[union-attr]
+            numbers.append(_TWO.pack(call.communication_point, call.step_size))  # type: ignore[union-attr]
+        else:
+            shape.append(_fields(call))
+    return _pack((_pack(shape), b"".join(numbers)))
+
+
+def _fields(call: Call) -> list[Any]:
+    return [call.verb, *(getattr(call, name) for name in _FIELDS.get(type(call), ()))]
+
+
+def _float_bytes(array: FloatArray) -> bytes:
+    return array.astype(_LITTLE_ENDIAN, copy=False).tobytes()
 
 
 def decode_program(data: bytes) -> list[Call]:
@@ -258,10 +382,17 @@ def decode_program(data: bytes) -> list[Call]:
     Raises:
         MalformedMessageError: not a list of at most ``MAX_CALLS`` well-formed calls.
     """
-    program = _unpack(data, "a program")
-    if type(program) is not list or len(program) > MAX_CALLS:
-        raise MalformedMessageError(f"a program must be a list of at most {MAX_CALLS} calls")
-    return [_call(item) for item in program]
+    shape, numbers = _shape_and_numbers(_unpack(data, "a program"), "a program")
+    plan = _cached_program_plan(shape) if _cached(shape) else _program_plan(shape)
+    return plan.build(numbers, "a program")
+
+
+def _shape_and_numbers(value: Any, what: str) -> tuple[bytes, bytes]:
+    match value:
+        case [bytes() as shape, bytes() as numbers]:
+            return shape, numbers
+        case _:
+            raise MalformedMessageError(f"{what} must be [shape, numbers], both bytes")
 
 
 def encode_request(epoch: int, sequence: int, program: bytes) -> bytes:
@@ -322,21 +453,35 @@ def decode_single(cls: type[Call], data: bytes) -> Call:
 # --- replies ------------------------------------------------------------------------------------
 
 
-def _pack_result(result: object) -> Any:
+def encode_reply(reply: Reply) -> bytes:
+    """A reply as bytes."""
+    error = None if reply.error is None else reply.error.to_reply()
+    shape: list[Any] = []
+    numbers: list[bytes] = []
+    for result in reply.results:
+        if result is None:
+            shape.append(None)
+        elif type(result) is np.ndarray:
+            shape.append(result.shape)
+            numbers.append(_float_bytes(result))
+        elif type(result) is StepResult:
+            shape.append(result.status.value)
+            numbers.append(_ONE.pack(result.time))
+        else:
+            shape.append(_plain(result))
+    packed = (PROTOCOL_VERSION, _pack(shape), b"".join(numbers), error, reply.compute_time)
+    return _pack(packed)
+
+
+def _plain(result: object) -> Any:
+    """A result by hand: with its numbers in it."""
     if isinstance(result, np.ndarray):
-        return _pack_array(result)
+        return [len(result), _float_bytes(result)]
     if isinstance(result, StepResult):
         return [result.status.value, result.time]
     if isinstance(result, SlaveDescription):
         return asdict(result)
     return result
-
-
-def encode_reply(reply: Reply) -> bytes:
-    """A reply as bytes."""
-    error = None if reply.error is None else reply.error.to_reply()
-    results = [_pack_result(result) for result in reply.results]
-    return _pack([PROTOCOL_VERSION, results, error, reply.compute_time])
 
 
 def encode_error(error: DoublestepError) -> bytes:
@@ -346,7 +491,7 @@ def encode_error(error: DoublestepError) -> bytes:
 
 def encode_single_reply(reply: Reply) -> bytes:
     """The reply to a single verb: a map with ``result``, and with ``error`` if there is one."""
-    answer: dict[str, Any] = {"result": _pack_result(reply.results[-1]) if reply.results else None}
+    answer: dict[str, Any] = {"result": _plain(reply.results[-1]) if reply.results else None}
     if reply.error is not None:
         answer["error"] = reply.error.to_reply()
     return _pack(answer)
@@ -360,34 +505,57 @@ def decode_reply(calls: Sequence[Call], data: bytes) -> Reply:
     """
     reply = _unpack(data, "a reply")
     if type(reply) is not list or not reply:
-        raise MalformedMessageError("a reply must be [version, results, error, compute_time]")
+        raise MalformedMessageError(_REPLY_FORM)
     _check_version(reply[0])
-    if len(reply) != 4 or type(reply[1]) is not list or len(reply[1]) > len(calls):
-        raise MalformedMessageError("a reply must be [version, results, error, compute_time]")
-    _, results, error, compute_time = reply
+    if len(reply) != 5:
+        raise MalformedMessageError(_REPLY_FORM)
+    _, shape, numbers, error, compute_time = reply
+    shape, numbers = _shape_and_numbers([shape, numbers], "a reply")
+    kinds = tuple(map(type, calls))
+    plan = _cached_reply_plan(shape, kinds) if _cached(shape) else _reply_plan(shape, kinds)
     return Reply(
-        [_result(call, result) for call, result in zip(calls, results, strict=False)],
+        plan.build(numbers, "a reply"),
         None if error is None else DoublestepError.from_reply(_mapping(error, "an error")),
         _number(compute_time, "compute_time"),
     )
 
 
-def _result(call: Call, value: Any) -> object:
-    match call:
-        case GetOutputs():
-            return _array(value, "outputs")
-        case DoStep():
-            if type(value) is not list or len(value) != 2:
-                raise MalformedMessageError("a step result must be [status, time]")
-            return StepResult(_member(StepStatus, value[0]), _number(value[1], "time"))
-        case SerializeState():
-            return _binary(value, "a serialized state")
-        case Describe():
-            return _description(value)
-        case _:
-            if value is not None:
-                raise MalformedMessageError("unexpected result", phase=call.verb)
-            return None
+_REPLY_FORM: Final = "a reply must be [version, shape, numbers, error, compute_time]"
+
+
+def _reply_plan(shape: bytes, kinds: tuple[type[Call], ...]) -> _Plan:
+    results = _unpack(shape, "a reply")
+    if type(results) is not list or len(results) > len(kinds):
+        raise MalformedMessageError(f"a reply must be a list of at most {len(kinds)} results")
+    builder = _PlanBuilder()
+    for kind, item in zip(kinds, results, strict=False):
+        if kind is GetOutputs:
+            if type(item) is not list or len(item) != 2:
+                raise MalformedMessageError("outputs must be [rows, columns]")
+            size = _matrix(item[0], item[1], "outputs")
+            builder.add_made(_array_maker(size), size[0] * size[1])
+        elif kind is DoStep:
+            builder.add_made(_step_result_maker(_member(StepStatus, item)), 1)
+        elif kind is Describe:
+            builder.add(_description(item))
+        elif kind is SerializeState:
+            builder.add(_binary(item, "a serialized state"))
+        elif item is None:
+            builder.add(None)
+        else:
+            raise MalformedMessageError("unexpected result", phase=kind.verb)
+    return builder.plan()
+
+
+_cached_reply_plan = lru_cache(_CACHED_SHAPES)(_reply_plan)
+
+
+def _array_maker(size: tuple[int, int]) -> _Maker:
+    return lambda numbers: numbers.reshape(size)
+
+
+def _step_result_maker(status: StepStatus) -> _Maker:
+    return lambda numbers: StepResult(status, float(numbers[0]))
 
 
 def _member(enum: Any, value: Any) -> Any:

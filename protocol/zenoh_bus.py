@@ -11,6 +11,7 @@ import ipaddress
 import json
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -27,8 +28,10 @@ os.environ.setdefault(
 import zenoh
 
 _LEASE_MS = 2000
+_FIRST_CONNECTION_MS = 100  # `open` waits so long for it, often in full; the default is 500
 _TIMEOUT_PAYLOAD = b"Timeout"
 _MAX_TOKENS = 4096
+_CLOSE_TIME = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +97,7 @@ def _config(endpoints: Endpoints) -> zenoh.Config:
             "period_max_ms": 200,
             "period_increase_factor": 2,
         },
+        "scouting/delay": _FIRST_CONNECTION_MS,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": _LEASE_MS,
@@ -122,6 +126,8 @@ class ZenohBus(Bus):
                 remedy="another process may use the port: end it or choose another with --listen",
             ) from error
         self._closing = threading.Event()
+        self._close_lock = threading.RLock()
+        self._threads: list[threading.Thread] = []
         self._kept: list[object] = []
 
     def caller(self, key: str, timeout: float) -> Caller:
@@ -136,9 +142,11 @@ class ZenohBus(Bus):
         """See `Bus`."""
         with _closed_is_lost():
             queryable = self._session.declare_queryable(key)
-        threading.Thread(
+        thread = threading.Thread(
             target=self._answer, args=(queryable, handler), name=f"serve {key}", daemon=True
-        ).start()
+        )
+        self._threads.append(thread)
+        thread.start()
 
     def serve_here(self, key: str, handler: Handler, ready: Callable[[], None]) -> None:
         """See `Bus`."""
@@ -151,7 +159,7 @@ class ZenohBus(Bus):
         self, queryable: zenoh.Queryable[zenoh.handlers.Handler[zenoh.Query]], handler: Handler
     ) -> None:
         try:
-            while True:
+            while not self._closing.is_set():
                 query = queryable.recv()
                 with query:
                     payload = query.payload
@@ -185,11 +193,20 @@ class ZenohBus(Bus):
             )
 
     def close(self) -> None:
-        """See `Bus`."""
-        if not self._closing.is_set():
-            self._closing.set()
-            with suppress(zenoh.ZError):
-                self._session.close()  # type: ignore[no-untyped-call]  # missing in zenoh's stub
+        """See `Bus`. Waits a bounded time for requests that are being served.
+
+        When this returns, whoever called it first, nothing of Zenoh is running any more: a thread
+        inside it at the end of the process would abort the process.
+        """
+        with self._close_lock:
+            if not self._closing.is_set():
+                self._closing.set()
+                with suppress(zenoh.ZError):
+                    self._session.close()  # type: ignore[no-untyped-call]  # not in zenoh's stub
+        end = time.monotonic() + _CLOSE_TIME
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, end - time.monotonic()))
 
 
 class _ZenohCaller(Caller):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import signal
 import sys
@@ -14,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from secrets import token_hex
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -28,6 +29,7 @@ app = typer.Typer(
     help="Serve an FMU or a Python model as a co-simulation slave.",
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 log = logging.getLogger("slave_node")
@@ -45,7 +47,7 @@ def serve(  # noqa: PLR0917  options of the command line
     ] = "",
     connect: Annotated[
         list[str] | None,
-        typer.Option(help=f"Master or router to connect to [default: {DEFAULT_ENDPOINT}]."),
+        typer.Option(help=f"Master to connect to [default: {DEFAULT_ENDPOINT}]."),
     ] = None,
     listen: Annotated[
         list[str] | None, typer.Option(help="Address on which masters can reach this slave.")
@@ -85,13 +87,17 @@ def serve(  # noqa: PLR0917  options of the command line
     node: SlaveNode | None = None
     ending = threading.Event()
 
+    def end_work() -> None:
+        if node is None or node.busy:  # loading, or in a step
+            worker.kill()
+
     def end(reason: str) -> None:
         ending.set()
         log.info("ending: %s", reason)
+        end_work()
         if bus is not None:
             bus.close()
-        if node is None or node.busy:  # loading, or in a step
-            worker.kill()
+            end_work()  # what began meanwhile; now nothing begins any more
 
     _end_on_signals(end)
     if stay_with_parent:
@@ -125,7 +131,7 @@ def inspect(
 
     description = describe_model(model, Path.cwd())
     if as_json:
-        typer.echo(json.dumps(asdict(description), indent=2))
+        typer.echo(json.dumps(_finite(asdict(description)), indent=2))
         return
     from rich.console import Console  # noqa: PLC0415
 
@@ -155,9 +161,23 @@ def _parameters(assignments: list[str]) -> dict[str, StartValue]:
     return values
 
 
+def _finite(value: Any) -> Any:
+    """The same with texts for the numbers that JSON does not have."""
+    match value:
+        case dict():
+            return {key: _finite(item) for key, item in value.items()}
+        case list() | tuple():
+            return [_finite(item) for item in value]
+        case float() if not math.isfinite(value):
+            return str(value)
+    return value
+
+
 def _end_on_signals(end: Callable[[str], None]) -> None:
+    """On a thread, because the one that gets the signal may hold any lock."""
+
     def handle(number: int, _: FrameType | None) -> None:
-        end(signal.Signals(number).name)
+        threading.Thread(target=end, args=(signal.Signals(number).name,), daemon=True).start()
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, handle)

@@ -30,7 +30,6 @@ from protocol.life_cycle import LIFE_CYCLE, LifeCycleState, refusal
 from protocol.slave import Slave, SlaveDescription, StepStatus
 from slave_node.snapshots import SnapshotStore
 
-
 _OK = StepStatus.OK
 
 

@@ -14,7 +14,9 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -110,6 +112,8 @@ class WorkerProcess:
         self._process: multiprocessing.process.BaseProcess | None = None
         self._pipe: Connection | None = None
         self._scratch: str | None = None
+        self._using = threading.Lock()
+        """Held while the pipe is in use; ``kill`` needs none and makes the holder let go."""
 
     @property
     def pid(self) -> int | None:
@@ -118,6 +122,10 @@ class WorkerProcess:
 
     def start(self) -> SlaveDescription:
         """See `Worker`. On Linux the process ends with the thread that called this."""
+        with self._using:
+            return self._start()
+
+    def _start(self) -> SlaveDescription:
         self._discard()
         self._scratch = tempfile.mkdtemp(prefix="doublestep-")
         context = multiprocessing.get_context("spawn")
@@ -150,32 +158,36 @@ class WorkerProcess:
         """See `Worker`."""
         if not program:  # on the pipe it means the end
             return encode_error(MalformedMessageError("a program is empty"))
-        if self._pipe is None:
-            raise SlaveCrashedError(
-                "the process that held the model is gone", remedy="claim the slave again"
-            )
-        try:
-            self._pipe.send_bytes(program)
-            return self._pipe.recv_bytes()
-        except (EOFError, OSError):
-            raise self._crashed() from None
+        with self._using:
+            if self._pipe is None:
+                raise SlaveCrashedError(
+                    "the process that held the model is gone", remedy="claim the slave again"
+                )
+            try:
+                self._pipe.send_bytes(program)
+                return self._pipe.recv_bytes()
+            except (EOFError, OSError):
+                raise self._crashed() from None
 
     def kill(self) -> None:
         """See `Worker`."""
         process = self._process
-        if process is not None and process.is_alive():
+        if process is not None and process.pid is not None:
             process.kill()
 
     def stop(self) -> None:
         """See `Worker`."""
-        if self._pipe is not None and self._process is not None:
-            try:
-                self._pipe.send_bytes(_END)
-            except OSError:
-                pass
-            else:
-                self._process.join(_CLOSE_TIME)
-        self._discard()
+        if not self._using.acquire(blocking=False):  # in a step, which nothing else ends
+            self.kill()
+            self._using.acquire()
+        try:
+            if self._pipe is not None and self._process is not None:
+                with suppress(OSError):
+                    self._pipe.send_bytes(_END)
+                    self._process.join(_CLOSE_TIME)
+            self._discard()
+        finally:
+            self._using.release()
 
     def _crashed(self) -> SlaveCrashedError:
         assert self._process is not None

@@ -74,7 +74,7 @@ def zenoh_network(endpoint: str) -> Iterator[Network]:
 # ---- Requests ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("payload", [b"", b"\0", bytes(range(256)), b"x" * 3_000_000])
+@pytest.mark.parametrize("payload", [b"", b"\0", bytes(range(256)), b"x" * 3_000_000], ids=len)
 def test_a_request_gets_its_reply(network: Network, payload: bytes) -> None:
     """Any bytes, also none and many, get there and back."""
     network.serve("a/echo", lambda data: data[::-1])

@@ -324,21 +324,35 @@ def test_saved_states_are_bounded() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (GetState(1), "a state is already saved under number 1"),
-        (DeserializeState(1, b""), "a state is already saved under number 1"),
         (SetState(7), "no state is saved under number 7; saved: 1, 2"),
         (FreeState(7), "no state is saved under number 7"),
         (SerializeState(7), "no state is saved under number 7"),
     ],
 )
 def test_a_wrong_number_is_named(call: Call, message: str) -> None:
-    """A number that is taken or free is the master's mistake; no saved state is lost by it."""
+    """A number that nothing is saved under is the master's mistake; no state is lost by it."""
     executor, slave = standing_in(LifeCycleState.STEP_COMPLETE)
     executor.execute([GetState(2)])
     reply = executor.execute([call])
     assert reply.error is not None
     assert message in reply.error.cause
     assert len(slave.live) == executor.saved_states == 2
+
+
+@pytest.mark.parametrize("call", [GetState(1), DeserializeState(1, b"state")])
+def test_a_number_can_be_used_again(call: Call) -> None:
+    """The state that was saved under it is freed once the new one is there, and not if it fails."""
+    executor, slave = standing_in(LifeCycleState.STEP_COMPLETE)
+    (old,) = slave.live
+    assert executor.execute([call]).error is None
+    assert slave.live == {old + 1}
+    assert slave.heard[-2:] == [call.verb, "free_state"]
+
+    slave.fails[call.verb] = SlaveError("no")
+    assert executor.execute([call]).error is not None
+    assert slave.live == {old + 1}
+    assert executor.execute([SetState(1)]).error is None
+    assert slave.misused == []
 
 
 @given(

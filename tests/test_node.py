@@ -245,6 +245,10 @@ class Served:
 
 Serve = Callable[..., Served]
 
+# What does not depend on the bus is tested over one of them.
+in_process = pytest.mark.parametrize("serve", ["in process"], indirect=True)
+over_zenoh = pytest.mark.parametrize("serve", ["zenoh"], indirect=True)
+
 
 @pytest.fixture(params=["in process", "zenoh"])
 def serve(request: pytest.FixtureRequest, models: Path, endpoint: str) -> Iterator[Serve]:
@@ -271,7 +275,7 @@ def serve(request: pytest.FixtureRequest, models: Path, endpoint: str) -> Iterat
         )
         workers.append(worker)
         description = worker.start()
-        bus, node_bus = make_bus(listen=True), make_bus()
+        node_bus, bus = make_bus(listen=True), make_bus()  # the node sees each of its masters
         node = SlaveNode(node_bus, worker, KEY, description, orphan_time)
         alive = threading.Event()
         bus.watch(KEY.alive, lambda _, up: alive.set() if up else None)
@@ -461,6 +465,7 @@ def test_a_name_is_on_the_bus_only_once(serve: Serve) -> None:
 # ---- A worker that dies ------------------------------------------------------------------------
 
 
+@over_zenoh
 @pytest.mark.parametrize(
     ("what", "words"),
     [
@@ -490,6 +495,7 @@ def test_a_crash_of_the_model_is_an_answer(serve: Serve, what: str, words: str) 
     second.release()
 
 
+@in_process
 def test_a_worker_that_died_unnoticed_is_revived_too(serve: Serve) -> None:
     """Killed from outside while nobody looked: neither a verb by hand nor a claim fails for it."""
     served = serve()
@@ -505,6 +511,7 @@ def test_a_worker_that_died_unnoticed_is_revived_too(serve: Serve) -> None:
     assert served.worker.pid not in (None, old)
 
 
+@in_process
 def test_a_fatal_slave_is_loaded_again_for_the_next_master(serve: Serve) -> None:
     """fmi2Fatal forbids every further call, a reset too, so the next claim gets a new process."""
     served = serve("Late", parameters={"what": "fatal"})
@@ -516,6 +523,7 @@ def test_a_fatal_slave_is_loaded_again_for_the_next_master(serve: Serve) -> None
     assert served.worker.pid not in (None, old)
 
 
+@in_process
 def test_a_model_that_cannot_be_loaded_again_leaves_the_slave_free(
     serve: Serve, models: Path
 ) -> None:
@@ -562,6 +570,7 @@ def test_status_is_answered_during_a_long_step(
     master.release()
 
 
+@over_zenoh
 def test_abort_ends_an_endless_step(
     serve: Serve, background: Background, begun: Pipe, go: Path
 ) -> None:
@@ -574,11 +583,7 @@ def test_abort_ends_an_endless_step(
         decode_map(master.ask(ABORT, encode_map({"epoch": master.epoch + 1})))
     assert outcome == []
     begin = time.perf_counter()
-    assert (
-        decode_map(master.ask(ABORT, encode_map({"epoch": master.epoch})))
-        == {"version": PROTOCOL_VERSION}
-        or True
-    )
+    decode_map(master.ask(ABORT, encode_map({"epoch": master.epoch})))
     wait_until(lambda: bool(outcome))
     assert time.perf_counter() - begin < 2.0
     (reply,) = outcome
@@ -603,47 +608,45 @@ def dead_pid() -> int:
 
 def vanishing(served: Served, run: str, **place: Any) -> tuple[Master, Callable[[], None]]:
     """A master that holds the slave with its token up, and how to make it vanish."""
-    bus = served.make_bus() if isinstance(served.bus, ZenohBus) else served.bus
-    token = alive_master(run)
+    bus, token = served.make_bus(), alive_master(run)
+    reached = threading.Event()
+    bus.watch(KEY.alive, lambda *_: reached.set())
+    assert reached.wait(BOUND)
     bus.announce(token)
-    seen = threading.Event()
-    served.bus.watch(token, lambda _, alive: seen.set() if alive else None)
-    assert seen.wait(BOUND)
-    master = Master(served.bus, run, **place).claim()
+    master = Master(bus, run, **place).claim()
     if isinstance(bus, InProcessBus):
         return master, lambda: bus.withdraw(token)
     return master, bus.close
 
 
-@pytest.fixture
-def reachable(serve: Serve, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Serve:
-    """As ``serve``; a master's token must reach the node, so over Zenoh the node listens."""
-    return serve
-
-
+@over_zenoh
 def test_a_slave_of_a_dead_master_is_free_at_once(serve: Serve, dead_pid: int) -> None:
     """Same host, dead process: there is nothing to wait for; the old epoch is worth nothing."""
     served = serve(orphan_time=1000.0)
     master, vanish = vanishing(served, "run-1", pid=dead_pid)
     master.start()
+    other = served.master("run-2")
     begin = time.perf_counter()
     vanish()
-    wait_until(lambda: master.status()["state"] == "free")
-    assert time.perf_counter() - begin < 3.0
-    assert type(master.execute(GetOutputs()).error) is SequenceError
-    served.master("run-2").claim().start().release()
+    wait_until(lambda: other.status()["state"] == "free")
+    assert time.perf_counter() - begin < 2.0
+    late = Master(served.bus, "run-1", epoch=master.epoch, sequence=master.sequence)
+    assert type(late.execute(GetOutputs()).error) is SequenceError
+    other.claim().start().release()
 
 
+@in_process
 def test_a_master_that_may_live_has_time_to_come_back(serve: Serve) -> None:
     """Gone from the bus but not dead for certain: held, until the orphan time is over."""
     served = serve(orphan_time=0.3)
-    master, vanish = vanishing(served, "run-1", host="elsewhere", pid=1)
+    _, vanish = vanishing(served, "run-1", host="elsewhere", pid=1)
     begin = time.perf_counter()
     vanish()
-    wait_until(lambda: master.status()["state"] == "free")
+    wait_until(lambda: served.master().status()["state"] == "free")
     assert time.perf_counter() - begin > 0.25
 
 
+@over_zenoh
 def test_a_dead_master_frees_a_slave_in_an_endless_step(
     serve: Serve, background: Background, begun: Pipe, go: Path, dead_pid: int
 ) -> None:
@@ -654,24 +657,22 @@ def test_a_dead_master_frees_a_slave_in_an_endless_step(
     outcome = background(lambda: master.execute(DoStep(0.0, 0.5)))
     begun.wait()
     vanish()
-    wait_until(lambda: master.status()["state"] == "free")
+    wait_until(lambda: served.master().status()["state"] == "free")
     wait_until(lambda: bool(outcome))
     served.master("run-2").claim().start().release()
 
 
+@in_process
 def test_another_master_that_leaves_changes_nothing(serve: Serve) -> None:
     """Only the holder's token matters, and a master that was back in time keeps its slave."""
     served = serve(orphan_time=0.1)
+    other, leave = vanishing(served, "run-2")
+    other.release()
     holder, vanish = vanishing(served, "run-1")
-    other = served.make_bus()
-    other.announce(alive_master("run-2"))
-    if isinstance(other, InProcessBus):
-        other.withdraw(alive_master("run-2"))
-    else:
-        other.close()
+    leave()
     holder.start()
     assert holder.status()["state"] == "held"
     assert value(holder.execute(GetOutputs())) == 0.0
     holder.release()
-    vanish()
     assert type(holder.execute(Reset()).error) is SequenceError
+    vanish()

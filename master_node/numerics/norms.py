@@ -25,15 +25,21 @@ def weighted_rms_norm(
 
     Returns:
         ERR and the index j of the largest part. Anything that is not finite in ``error`` or ``y``
-        gives infinity and the index of such a value: NaN never passes.
+        gives infinity and the index of such a value: NaN never passes. NumPy may warn of such
+        values on the way, unless the caller has it ignore them.
     """
+    scale = np.abs(y)
+    scale *= relative_tolerance
+    scale += absolute_tolerance
     weighted = np.abs(error)
-    weighted /= absolute_tolerance + relative_tolerance * np.abs(y)
+    weighted /= scale
     square = weighted.dot(weighted)
-    if square < np.inf:  # false for NaN too
+    if square < np.inf and scale.dot(scale) < np.inf:  # false for NaN too
         return sqrt(square / len(weighted)), int(weighted.argmax())
     bad = ~(np.isfinite(weighted) & np.isfinite(y))
-    return np.inf, int(bad.argmax() if bad.any() else weighted.argmax())
+    if bad.any():
+        return np.inf, int(bad.argmax())
+    return sqrt(square / len(weighted)), int(weighted.argmax())  # only large
 
 
 def first_not_finite(y: FloatArray) -> int | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, isnan
+from math import ceil, isfinite, isnan, ulp
 from typing import NamedTuple
 
 
@@ -76,3 +76,16 @@ def last_step_size(time: float, stop_time: float, step_size: float) -> float:
     if 4.0 * step_size > left:
         return left / 4.0
     return step_size
+
+
+def fixed_steps(start_time: float, stop_time: float, step_size: float) -> int:
+    """How many steps of H lead from ``start_time`` to ``stop_time``, a last shorter one included.
+
+    Points start + n H and the stop time are sums with a few rounding errors: a remainder of that
+    size is no step.
+    """
+    whole = round((stop_time - start_time) / step_size)
+    rounding = 4.0 * ulp(max(abs(start_time), abs(stop_time)))
+    if whole and abs(start_time + whole * step_size - stop_time) <= rounding:
+        return whole
+    return ceil((stop_time - start_time) / step_size)

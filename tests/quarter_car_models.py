@@ -1,0 +1,84 @@
+"""Python models for the tests, loaded by name as those of a user are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import sleep
+from typing import Any
+
+from protocol.slave import Variable, VariableType
+from slave_node.model import Model, real
+from slave_node.model_loading import load_model_class
+
+_EXAMPLES = Path(__file__).parents[1] / "examples" / "quarter_car"
+_Chassis: Any = load_model_class("quarter_car.py:Chassis", _EXAMPLES)
+_Wheel: Any = load_model_class("quarter_car.py:Wheel", _EXAMPLES)
+
+RAMP_TIME = 0.5
+RAMP_POWER = 5
+
+
+class SmoothChassis(_Chassis):
+    """The chassis, integrated nearly exactly when the tolerance asks for it."""
+
+    solver = "DOP853"
+
+
+class SmoothWheel(_Wheel):
+    """The wheel on a road that rises as z (t / T)^5 from t = 0 on.
+
+    Before that the car really rests, and the motion has its first four derivatives at 0: a start-up
+    history at rest is exact, and the polynomials of degree up to 3 see no kink.
+    """
+
+    solver = "DOP853"
+
+    def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
+        """Newton's law, with the height of the road at t instead of z."""
+        v, acceleration = super().derivatives(t, x, u)
+        rise = self.z * ((t / RAMP_TIME) ** RAMP_POWER - 1.0)
+        return [v, acceleration + self.k_w * rise / self.m]
+
+
+class Gain(Model):
+    """y = gain u + offset: nothing but direct feed-through."""
+
+    inputs = (real("u"),)
+    outputs = (real("y"),)
+    parameters = (real("gain", start=1.0), real("offset", start=0.0))
+    feed_through = {"y": ("u",)}  # noqa: RUF012  as a user writes it
+
+    def output_values(self, t: float, x: Any, u: Any) -> list[float]:
+        """The output."""
+        return [self.gain * u[0] + self.offset]
+
+
+class BreaksDown(_Chassis):
+    """A chassis whose equations have no value from ``breaks_at`` on: do_step fails."""
+
+    parameters = (*_Chassis.parameters, real("breaks_at", "s", start=0.1))
+
+    def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
+        """A logarithm of a negative number, as it were."""
+        if t >= self.breaks_at:
+            raise ValueError("math domain error")
+        return list(super().derivatives(t, x, u))
+
+
+class Sleeper(_Chassis):
+    """A chassis that takes ``nap`` seconds for every step from ``sleeps_at`` on, and says so."""
+
+    parameters = (
+        *_Chassis.parameters,
+        real("sleeps_at", "s", start=0.0),
+        real("nap", "s", start=0.0),
+        Variable("bed", type=VariableType.STRING, start=""),
+    )
+
+    def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
+        """The chassis' equations, later."""
+        if t >= self.sleeps_at:
+            if self.bed:
+                Path(self.bed).touch()
+            sleep(self.nap)
+        return list(super().derivatives(t, x, u))

@@ -1,0 +1,478 @@
+"""System files: what they mean, and that every mistake is found before anything starts."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from master_node import BusSettings, SimulationSettings, System, load_system
+from master_node.configuration import OutputTolerance, SlaveSettings
+from master_node.simulation import settings_of
+from master_node.slaves import slaves_on_bus
+from protocol.errors import ConfigurationError
+from tests.quarter_car_case import EXAMPLES
+
+SYSTEM = """
+[simulation]
+stop_time = 4.0
+
+[slaves.chassis]
+model = "chassis.fmu"
+
+[slaves.wheel]
+model = "wheel.fmu"
+
+[[connections]]
+from = "wheel.x"
+to = "chassis.x_w"
+
+[[connections]]
+from = "chassis.x"
+to = "wheel.x_c"
+"""
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    """A system file."""
+    path = tmp_path / "car.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(tmp_path: Path, text: str) -> str:
+    """Why the file is refused, without its own name, which must stand in front of each line."""
+    path = written(tmp_path, text)
+    with pytest.raises(ConfigurationError) as info:
+        load_system(path)
+    lines = str(info.value).splitlines()
+    assert all(line.startswith(f"{path}: ") for line in lines)
+    return "\n".join(line.removeprefix(f"{path}: ") for line in lines)
+
+
+def simulation(line: str) -> str:
+    """The system file with another line in its ``[simulation]`` table."""
+    return SYSTEM.replace("stop_time = 4.0", f"stop_time = 4.0\n{line}")
+
+
+def wheel(line: str) -> str:
+    """The same for ``[slaves.wheel]``."""
+    return SYSTEM.replace('model = "wheel.fmu"', f'model = "wheel.fmu"\n{line}')
+
+
+def bus(line: str) -> str:
+    """The same with a ``[bus]`` table."""
+    return f"{SYSTEM}\n[bus]\n{line}\n"
+
+
+# ---- What a file means --------------------------------------------------------------------------
+
+
+def test_a_file_is_read_as_it_is_written(tmp_path: Path) -> None:
+    """All keys of all tables arrive, and numbers may be written as integers."""
+    text = """
+    [simulation]
+    start_time = 1
+    stop_time = 5
+    initial_step_size = 0.25
+    order = 3
+    estimator = "rich"
+    relative_tolerance = 0
+    absolute_tolerance = 1e-6
+    slave_tolerance = 1e-8
+    alpha = 0.9
+    theta_min = 0.2
+    theta_max = 5.0
+    smallest_step_size = 1e-6
+    largest_step_size = 0.5
+    initial_history = "none"
+
+    [slaves.a]
+    model = "a.fmu"
+    parameters = { m = 40.0, n = 3, on = true, name = "text" }
+    relative_tolerance = 1e-3
+    absolute_tolerance = 1e-2
+    tolerances = { x = { relative = 1e-5, absolute = 1e-7 } }
+
+    [slaves."b.c"]
+
+    [[connections]]
+    from = "a.x"
+    to = "b.c.y"
+
+    [bus]
+    listen = ["tcp/127.0.0.1:7447"]
+    connect = ["tcp/127.0.0.1:7448"]
+    insecure = true
+    discovery_timeout = 5
+    step_timeout = 0.5
+    """
+    path = written(tmp_path, text)
+    system = load_system(path)
+    assert system.simulation == SimulationSettings(
+        start_time=1,
+        stop_time=5,
+        initial_step_size=0.25,
+        order=3,
+        estimator="rich",
+        relative_tolerance=0,
+        absolute_tolerance=1e-6,
+        slave_tolerance=1e-8,
+        alpha=0.9,
+        theta_min=0.2,
+        theta_max=5.0,
+        smallest_step_size=1e-6,
+        largest_step_size=0.5,
+        initial_history="none",
+    )
+    assert dict(system.slaves) == {
+        "a": SlaveSettings(
+            model="a.fmu",
+            parameters={"m": 40.0, "n": 3, "on": True, "name": "text"},
+            relative_tolerance=1e-3,
+            absolute_tolerance=1e-2,
+            tolerances={"x": OutputTolerance(relative=1e-5, absolute=1e-7)},
+        ),
+        "b.c": SlaveSettings(),
+    }
+    parameters = system.slaves["a"].parameters
+    assert [type(value) for value in parameters.values()] == [float, int, bool, str]
+    assert [(c.source, c.target) for c in system.connections] == [("a.x", "b.c.y")]
+    assert system.bus == BusSettings(
+        listen=("tcp/127.0.0.1:7447",),
+        connect=("tcp/127.0.0.1:7448",),
+        insecure=True,
+        discovery_timeout=5,
+        step_timeout=0.5,
+    )
+    assert system.base == tmp_path
+    assert system.source == str(path)
+
+
+def test_defaults_are_those_that_the_documentation_names(tmp_path: Path) -> None:
+    """The paper's ranges for the controller; the slaves' tolerance two orders below the master's."""
+    settings = load_system(written(tmp_path, SYSTEM)).simulation
+    assert settings.start_time == 0.0
+    assert settings.step_size == pytest.approx(4e-3)
+    assert (settings.order, settings.estimator) == (1, "mod")
+    assert (settings.relative_tolerance, settings.absolute_tolerance) == (1e-4, 1e-4)
+    assert settings.slave_relative_tolerance == pytest.approx(1e-6)
+    assert (settings.alpha, settings.theta_min, settings.theta_max) == (0.85, 0.3, 2.0)
+    assert (settings.smallest, settings.largest) == pytest.approx((4e-9, 2.0))
+    assert settings.initial_history == "rest"
+
+
+@given(
+    st.floats(1e-3, 1e6),
+    st.one_of(st.none(), st.floats(1e-9, 1e6)),
+    st.one_of(st.none(), st.floats(1e-9, 1e6)),
+)
+def test_default_step_sizes_keep_each_others_bounds(
+    stop: float, smallest: float | None, largest: float | None
+) -> None:
+    """smallest <= H_0 <= largest whatever of them is given, or the message names what is."""
+    bounds = {"smallest_step_size": smallest, "largest_step_size": largest}
+    given_bounds = {name: value for name, value in bounds.items() if value is not None}
+    try:
+        settings = SimulationSettings(stop_time=stop, **given_bounds)
+    except ValueError as error:
+        assert smallest is not None  # noqa: PT017
+        assert largest is not None  # noqa: PT017
+        assert smallest > largest  # noqa: PT017
+        assert "smallest_step_size" in str(error)  # noqa: PT017
+        return
+    assert settings.smallest <= settings.step_size
+    if largest is not None:
+        assert settings.step_size <= largest
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.toml")))
+def test_the_examples_are_right(name: str) -> None:
+    """The files that a newcomer copies load, and their models are named relative to them."""
+    system = load_system(EXAMPLES / name)
+    assert system.base == EXAMPLES
+    assert set(system.slaves) == {"chassis", "wheel"}
+
+
+def test_settings_are_frozen(tmp_path: Path) -> None:
+    """A run cannot change what it was asked for."""
+    system = load_system(written(tmp_path, SYSTEM))
+    with pytest.raises(ValueError, match="frozen"):
+        system.simulation.order = 2
+    with pytest.raises(ValueError, match="frozen"):
+        system.bus = BusSettings()
+
+
+def test_a_system_goes_round_trip(tmp_path: Path) -> None:
+    """The settings in ``summary.json`` make the same system again."""
+    text = wheel("parameters = { z = 0.2 }\ntolerances = { x = { absolute = 1e-6 } }")
+    system = load_system(written(tmp_path, text))
+    tables = system.model_dump(mode="json", by_alias=True)
+    assert System(**tables, base=system.base, source=system.source) == system
+    assert settings_of(system, {})["slaves"] == tables["slaves"]
+
+
+def test_a_system_is_described_in_python_too() -> None:
+    """Pairs are connections, plain dictionaries are tables."""
+    system = System(
+        simulation={"stop_time": 1.0},
+        slaves={"a": {"model": "a.fmu"}, "b": {"model": "b.fmu"}},
+        connections=[("a.y", "b.u"), {"from": "b.y", "to": "a.u"}],
+    )
+    assert [(c.source, c.target) for c in system.connections] == [("a.y", "b.u"), ("b.y", "a.u")]
+    assert system.base == Path.cwd()
+    with pytest.raises(ConfigurationError, match=r"^the system: \[simulation\] order = 9: "):
+        System(simulation={"order": 9}, slaves={"a": {}})
+
+
+# ---- Overrides ----------------------------------------------------------------------------------
+
+
+def test_overrides_change_what_they_name_and_nothing_else(tmp_path: Path) -> None:
+    """The command line wins over the file; None leaves a setting as it is."""
+    system = load_system(written(tmp_path, simulation("order = 2\nalpha = 0.9")))
+    changed = system.with_simulation(order=3, estimator="rich", stop_time=None, alpha=None)
+    assert changed.simulation == SimulationSettings(
+        stop_time=4.0, order=3, alpha=0.9, estimator="rich"
+    )
+    assert (changed.slaves, changed.connections) == (system.slaves, system.connections)
+    assert (changed.base, changed.source) == (system.base, system.source)
+    assert system.simulation.order == 2
+
+
+def test_derived_defaults_follow_an_override(tmp_path: Path) -> None:
+    """What the file does not give depends on the overridden values, not on the old ones."""
+    system = load_system(written(tmp_path, SYSTEM))
+    shorter = system.with_simulation(stop_time=0.4, relative_tolerance=1e-2).simulation
+    assert shorter.step_size == pytest.approx(0.4e-3)
+    assert shorter.slave_relative_tolerance == pytest.approx(1e-4)
+
+
+def test_a_wrong_override_is_refused_like_a_wrong_file(tmp_path: Path) -> None:
+    """The same checks, with the same words."""
+    system = load_system(written(tmp_path, SYSTEM))
+    with pytest.raises(ConfigurationError, match=r"car\.toml: \[simulation\] .*after start_time"):
+        system.with_simulation(start_time=4.0)
+    with pytest.raises(ConfigurationError, match=r"\[simulation\] estimator = 'modd': .*'mod'"):
+        system.with_simulation(estimator="modd")
+    with pytest.raises(ConfigurationError, match="unknown key 'ordr'; did you mean 'order'"):
+        system.with_simulation(ordr=1)
+
+
+def test_bus_overrides(tmp_path: Path) -> None:
+    """Empty lists and switches that were not given leave the file's settings."""
+    system = load_system(written(tmp_path, bus('listen = ["tcp/127.0.0.1:1"]\ninsecure = true')))
+    changed = system.with_bus(connect=("tcp/a:2",), listen=(), insecure=False, step_timeout=None)
+    assert changed.bus == BusSettings(
+        listen=("tcp/127.0.0.1:1",), connect=("tcp/a:2",), insecure=True
+    )
+    assert changed.simulation == system.simulation
+
+
+def test_a_missing_stop_time_may_come_later_but_must_come(tmp_path: Path) -> None:
+    """The file may leave it to the command line; without it nothing is started."""
+    system = load_system(written(tmp_path, SYSTEM.replace("stop_time = 4.0", "")))
+    assert system.with_simulation(stop_time=2.0).simulation.end == 2.0
+    with pytest.raises(
+        ConfigurationError, match=r"car\.toml: \[simulation\] stop_time is missing; .*--stop-time"
+    ):
+        settings_of(system, {})
+
+
+# ---- Mistakes -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (simulation("oder = 1"), "[simulation] unknown key 'oder'; did you mean 'order'"),
+        (simulation("tolerance = 1"), "[simulation] unknown key 'tolerance'; did you mean "),
+        (
+            SYSTEM.replace("[simulation]", "[simulaton]"),
+            "unknown key 'simulaton'; did you mean 'simulation'?",
+        ),
+        (f"{SYSTEM}\n[base]\n", "base: unknown table or key"),
+        (f"source = 'x'\n{SYSTEM}", "source: unknown table or key"),
+        (wheel("modl = 1"), "[slaves.wheel] unknown key 'modl'; did you mean 'model'?"),
+        (
+            wheel("tolerances = { x = { relativ = 1.0 } }"),
+            "[slaves.wheel.tolerances.x] unknown key 'relativ'; did you mean 'relative'?",
+        ),
+        (
+            f"{SYSTEM}\nunit = 1",
+            "[[connections]] number 2: unknown key 'unit'; there is 'from', 'to'",
+        ),
+        (bus("conect = []"), "[bus] unknown key 'conect'; did you mean 'connect'?"),
+    ],
+)
+def test_unknown_keys_are_mistakes_everywhere(tmp_path: Path, text: str, words: str) -> None:
+    """A misspelt key is named with its table and the nearest key that there is."""
+    assert words in refusal(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("order", "4", "0, 1, 2 or 3"),
+        ("order", "-1", "0, 1, 2 or 3"),
+        ("order", "true", "0, 1, 2 or 3"),
+        ("order", '"1"', "0, 1, 2 or 3"),
+        ("estimator", '"richardson"', "'rich', 'mod' or 'none'"),
+        ("initial_history", '"zero"', "'rest' or 'none'"),
+        ("relative_tolerance", "-1e-4", "greater than or equal to 0"),
+        ("absolute_tolerance", "0", "greater than 0"),
+        ("absolute_tolerance", "nan", ""),
+        ("slave_tolerance", "0.0", "greater than 0"),
+        ("initial_step_size", "0", "greater than 0"),
+        ("initial_step_size", "-1e-3", "greater than 0"),
+        ("initial_step_size", "inf", "finite"),
+        ("smallest_step_size", "0.0", "greater than 0"),
+        ("largest_step_size", "-1", "greater than 0"),
+        ("alpha", "1.0", "less than 1"),
+        ("alpha", "0", "greater than 0"),
+        ("theta_min", "1.5", "less than 1"),
+        ("theta_max", "1", "greater than 1"),
+        ("start_time", "nan", "finite"),
+        ("start_time", '"0"', "number"),
+        ("start_time", "true", "number"),
+        ("start_time", "[0.0]", "number"),
+    ],
+)
+def test_wrong_values_are_named_with_what_is_allowed(
+    tmp_path: Path, key: str, value: str, words: str
+) -> None:
+    """Table, key, the value as it was given, and what would be right."""
+    text = refusal(tmp_path, simulation(f"{key} = {value}"))
+    assert text.startswith(f"[simulation] {key} = ")
+    assert words in text
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ("start_time = 4.0", "stop_time 4 must be after start_time 4"),
+        ("start_time = 5.0", "stop_time 4 must be after start_time 5"),
+        (
+            "initial_step_size = 1e-3\nsmallest_step_size = 1e-2",
+            "initial_step_size 0.001 is below smallest_step_size 0.01",
+        ),
+        (
+            "initial_step_size = 0.1\nlargest_step_size = 1e-2",
+            "initial_step_size 0.1 is above largest_step_size 0.01",
+        ),
+        (
+            "smallest_step_size = 0.1\nlargest_step_size = 0.01",
+            "smallest_step_size 0.1 is above largest_step_size 0.01",
+        ),
+    ],
+)
+def test_values_that_contradict_each_other(tmp_path: Path, lines: str, words: str) -> None:
+    """Both keys are named with both values."""
+    assert refusal(tmp_path, simulation(lines)) == f"[simulation] {words}"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "key 'slaves' is missing"),
+        ("[slaves]", "at least one [slaves.NAME] table is needed"),
+        ("slaves = 3", "slaves = 3"),
+        ('[slaves]\nwheel = "wheel.fmu"', "[slaves] wheel = 'wheel.fmu': must be a table"),
+        ('[slaves."a/b"]', "'a/b' is not a valid slave name; use 1 to 128 characters out of"),
+        ('[slaves."a*"]', "'a*' is not a valid slave name"),
+        ('[slaves.""]', "'' is not a valid slave name"),
+        ('simulation = "x"\n[slaves.a]', "simulation = 'x': must be a table"),
+        ("[slaves.a]\nmodel = 3", "[slaves.a] model = 3: "),
+        (
+            "[slaves.a]\nparameters = { m = [1.0] }",
+            "[slaves.a.parameters] m = [1.0]: must be a number, a boolean or a string",
+        ),
+        ("[slaves.a]\nrelative_tolerance = -1", "[slaves.a] relative_tolerance = -1: "),
+        ("[slaves.a]\nabsolute_tolerance = 0", "[slaves.a] absolute_tolerance = 0: "),
+        ("[slaves.a]\ntolerances = { x = 1 }", "[slaves.a.tolerances] x = 1: must be a table"),
+        (
+            "[slaves.a]\ntolerances = { x = { absolute = 0 } }",
+            "[slaves.a.tolerances.x] absolute = 0: ",
+        ),
+        ("[slaves.a]\n[connections]", "connections = {}: must be an array"),
+        ('[slaves.a]\n[[connections]]\nto = "a.u"', "[[connections]] number 1: key 'from'"),
+        ('[slaves.a]\n[[connections]]\nfrom = "a.y"', "[[connections]] number 1: key 'to'"),
+        (
+            '[slaves.a]\n[[connections]]\nfrom = 3\nto = "a.u"',
+            "[[connections]] number 1: from = 3: ",
+        ),
+        (
+            '[slaves.a]\n[[connections]]\nfrom = "a"\nto = "a.u"',
+            "[[connections]] number 1: from = 'a': write slave.variable",
+        ),
+        ('[slaves.a]\n[bus]\nlisten = "x"', "[bus] listen = 'x': must be an array"),
+        ("[slaves.a]\n[bus]\ninsecure = 1", "[bus] insecure = 1: "),
+        ("[slaves.a]\n[bus]\nstep_timeout = 0", "[bus] step_timeout = 0: "),
+        ("[slaves.a]\n[bus]\ndiscovery_timeout = -1", "[bus] discovery_timeout = -1: "),
+        ("[slaves.a]\n[slaves.a]", "not a TOML file: "),
+        ("[slaves.a", "not a TOML file: "),
+    ],
+)
+def test_mistakes_are_named_with_their_table(tmp_path: Path, text: str, words: str) -> None:
+    """Whatever is wrong, the message says in which table, at which key, and what it should be."""
+    assert words in refusal(tmp_path, text)
+
+
+def test_all_mistakes_are_told_at_once(tmp_path: Path) -> None:
+    """A line for each, so that a file is put right in one go."""
+    text = simulation("order = 7\nestimator = 1") + "\nunit = 3\n[bus]\nport = 1"
+    lines = refusal(tmp_path, text).splitlines()
+    assert len(lines) == 4
+    for part in ("order", "estimator", "unit", "port"):
+        assert sum(part in line for line in lines) == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: None, "cannot be read: No such file or directory"),
+        (lambda path: path.mkdir(), "cannot be read: Is a directory"),
+        (lambda path: path.write_bytes(b"\xff\xfe"), "not a TOML file: "),
+    ],
+)
+def test_a_file_that_cannot_be_read(tmp_path: Path, make: Any, words: str) -> None:
+    """A sentence with the path, whatever lies there."""
+    path = tmp_path / "car.toml"
+    make(path)
+    with pytest.raises(ConfigurationError, match=f"{re.escape(str(path))}: {words}"):
+        load_system(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('listen = ["127.0.0.1:7447"]', "'127.0.0.1:7447' is not an endpoint; write tcp/HOST:PORT"),
+        ('connect = ["tcp/127.0.0.1"]', "'tcp/127.0.0.1' is not an endpoint"),
+        ('listen = ["tcp/0.0.0.0:0"]', "tcp/0.0.0.0:0 is not a loopback address"),
+        ('connect = ["tcp/example.org:1"]', "tcp/example.org:1 is not a loopback address"),
+    ],
+)
+def test_endpoints_are_checked_before_anything_starts(
+    tmp_path: Path, line: str, words: str
+) -> None:
+    """No slave is launched and no port opened for an address that cannot be right or is unsafe."""
+    system = load_system(written(tmp_path, bus(line)))
+    expected = rf"car\.toml: \[bus\] {re.escape(words)}"
+    with pytest.raises(ConfigurationError, match=expected), slaves_on_bus(system, tmp_path):
+        pytest.fail("it started")
+    assert list(tmp_path.glob("*.log")) == []
+
+
+@given(st.text(max_size=200))
+def test_no_text_breaks_the_reader(text: str) -> None:
+    """Any text is a system or a `ConfigurationError`, never another exception."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "any.toml"
+        path.write_bytes(text.encode("utf-8", "surrogatepass"))
+        with pytest.raises(ConfigurationError):
+            load_system(path)

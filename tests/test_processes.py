@@ -1,0 +1,589 @@
+"""Real processes over real Zenoh: the same bits everywhere, and every fault a clear end.
+
+Each test starts the commands as a user does. Nothing may be left running after any of them.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from master_node import Result, load_system, simulate
+from tests.quarter_car_case import DISPLACEMENT, EXAMPLES, global_errors
+
+pytestmark = [
+    pytest.mark.skipif(os.name != "posix", reason="uses signals"),
+    pytest.mark.usefixtures("no_process_left"),
+]
+
+BOUND = 30.0
+"""No wait in these tests is longer [s]."""
+
+AT_ONCE = 1.0
+"""What an end on request may take [s]."""
+
+MODELS = Path(__file__).parent / "quarter_car_models.py"
+FOREVER = "stop_time = 1e6\nlargest_step_size = 1e-3\nsmallest_step_size = 1e-9\n"
+
+
+class Command:
+    """A command in a process of its own; its standard error is read as it comes."""
+
+    def __init__(self, module: str, *words: object) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module, *map(str, words)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, "COLUMNS": "500", "MPLBACKEND": "Agg"},
+        )
+        self._lines: queue.Queue[str | None] = queue.Queue()
+        self.text = ""
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    @property
+    def process(self) -> psutil.Process:
+        """To look at its children."""
+        return psutil.Process(self._process.pid)
+
+    def wait_for(self, words: str) -> None:
+        """Until it says so."""
+        end = time.monotonic() + BOUND
+        while True:
+            line = self._lines.get(timeout=max(0.0, end - time.monotonic()))
+            assert line is not None, f"it ended without {words!r}:\n{self.text}"
+            self.text += line
+            if words in line:
+                return
+
+    def wait(self, timeout: float = BOUND) -> int:
+        """Its exit code; what it had to say is in ``text``."""
+        code = self._process.wait(timeout)
+        while (line := self._lines.get(timeout=BOUND)) is not None:
+            self.text += line
+        return code
+
+    def send(self, number: signal.Signals) -> None:
+        """A signal."""
+        self._process.send_signal(number)
+
+    def close(self) -> None:
+        """End it, whatever it does."""
+        self._process.kill()
+        self._process.wait(BOUND)
+        self._reader.join(BOUND)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Command]]:
+    """``start("master_node", "run", ...)``; what still runs after the test is ended."""
+    commands: list[Command] = []
+
+    def start_command(module: str, *words: object) -> Command:
+        commands.append(Command(module, *words))
+        return commands[-1]
+
+    yield start_command
+    for command in commands:
+        command.close()
+
+
+Start = Callable[..., Command]
+
+
+def toml(value: object) -> str:
+    """A value in TOML's notation."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + " }"
+    return f'"{value}"' if isinstance(value, str | Path) else str(value)
+
+
+def system_file(
+    folder: Path,
+    chassis: object = "quarter_car.py:Chassis",
+    wheel: object = "quarter_car.py:Wheel",
+    *,
+    simulation: str = "stop_time = 0.3\n",
+    bus: str = "",
+    chassis_parameters: dict[str, Any] | None = None,
+    connections: Sequence[tuple[str, str]] = DISPLACEMENT,
+) -> Path:
+    """The quarter car as a system file; a slave without a model is looked for on the bus."""
+    text = f"[simulation]\ninitial_step_size = 1e-3\n{simulation}"
+    for name, model in (("chassis", chassis), ("wheel", wheel)):
+        text += f"[slaves.{name}]\n"
+        if model is not None:
+            text += f"model = {toml(EXAMPLES / str(model))}\n"
+        if name == "chassis" and chassis_parameters:
+            text += f"parameters = {toml(chassis_parameters)}\n"
+    for source, target in connections:
+        text += f'[[connections]]\nfrom = "{source}"\nto = "{target}"\n'
+    path = folder / "car.toml"
+    path.write_text(f"{text}[bus]\n{bus}")
+    return path
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    """For what no event tells of: the state of a file or of another process."""
+    end = time.monotonic() + BOUND
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def endpoints(number: int) -> list[str]:
+    """Addresses on loopback that nobody listens on."""
+    probes = [socket.create_server(("127.0.0.1", 0)) for _ in range(number)]
+    ports = [probe.getsockname()[1] for probe in probes]
+    for probe in probes:
+        probe.close()
+    return [f"tcp/127.0.0.1:{port}" for port in ports]
+
+
+def slave_processes(master: Command) -> dict[str, psutil.Process]:
+    """The nodes that a master launched, by the names of their slaves."""
+    nodes = {}
+    for child in master.process.children(recursive=True):
+        words = child.cmdline()
+        if "slave_node" in words and "--name" in words:
+            nodes[words[words.index("--name") + 1]] = child
+    return nodes
+
+
+def worker_of(node: psutil.Process) -> psutil.Process:
+    """The process that holds the model."""
+    (worker,) = [
+        child
+        for child in node.children()
+        if any("spawn_main" in word for word in child.cmdline())
+        and not any("resource_tracker" in word for word in child.cmdline())
+    ]
+    return worker
+
+
+def assert_readable(directory: Path) -> Result:
+    """Results up to the last accepted step: whole rows, and as many as the steps say."""
+    result = Result.load(directory)
+    taken = result.steps[result.steps["accepted"]]
+    assert len(result.time) == 1 + 2 * len(taken)
+    assert (np.diff(result.time) > 0.0).all()
+    assert global_errors(result).max() < 5e-3
+    return result
+
+
+def assert_summary(directory: Path, outcome: str) -> Result:
+    """The same, with a summary that agrees."""
+    result = assert_readable(directory)
+    assert result.summary["outcome"] == outcome
+    assert result.summary["communication_steps"] == len(result.time) - 1
+    return result
+
+
+# ---- The same bits ------------------------------------------------------------------------------
+
+
+def test_the_same_bits_in_process_launched_and_by_hand(
+    start: Start, tmp_path: Path, fmu_dir: Path, endpoint: str
+) -> None:
+    """Law: results.csv and steps.csv do not depend on where the slaves are."""
+    models = {name: fmu_dir / f"{name}.fmu" for name in ("chassis", "wheel")}
+    file = system_file(tmp_path, **models, simulation="stop_time = 1.0\norder = 2\n")
+    common = ("master_node", "run", file, "--no-plot", "--output")
+    by_hand = [
+        start("slave_node", "serve", model, "--name", name, "--connect", endpoint)
+        for name, model in models.items()
+    ]
+    masters = [
+        start(*common, tmp_path / "in process", "--in-process"),
+        start(*common, tmp_path / "launched"),
+        start(*common, tmp_path / "by hand", "--no-launch", "--listen", endpoint),
+    ]
+    for master in masters:
+        assert master.wait() == 0, master.text
+    for file_name in ("results.csv", "steps.csv"):
+        contents = {path: (tmp_path / path / file_name).read_bytes() for path in ("in process",)}
+        for path in ("launched", "by hand"):
+            assert (tmp_path / path / file_name).read_bytes() == contents["in process"]
+    result = assert_summary(tmp_path / "launched", "completed")
+    assert result.time[-1] == 1.0
+    attempts = len(result.steps)
+    assert result.summary["requests"] == {"chassis": 2 * attempts, "wheel": 2 * attempts}
+    for slave in by_hand:  # they wait for the next master
+        slave.send(signal.SIGTERM)
+        assert slave.wait() == 0
+        assert "claimed by" in slave.text
+        assert "released by" in slave.text
+
+
+def test_simulate_launches_slaves_too(tmp_path: Path, fmu_dir: Path) -> None:
+    """From Python: over Zenoh the same bits as in process, with direct feed-through."""
+    system = load_system(EXAMPLES / "displacement_force_python.toml")
+    options = {"stop_time": 0.2, "order": 2, "estimator": "rich"}
+    a = simulate(system, **options)
+    b = simulate(system, in_process=True, **options)
+    assert a.time.tobytes() == b.time.tobytes()
+    assert a.outputs.tobytes() == b.outputs.tobytes()
+    assert a.steps.tolist() == b.steps.tolist()
+
+
+def test_a_run_leaves_all_files_and_the_commands_read_them(start: Start, tmp_path: Path) -> None:
+    """run, plot, compare: what the readme shows, from a system file to a picture."""
+    file = system_file(tmp_path)
+    fine, coarse = tmp_path / "fine", tmp_path / "coarse"
+    runs = [
+        start("master_node", "run", file, "--in-process", "--output", fine),
+        start(
+            *("master_node", "run", file, "--in-process", "--output", coarse, "--no-plot"),
+            *("--relative-tolerance", "1e-2", "--absolute-tolerance", "1e-2", "--order", "0"),
+            *("--estimator", "rich", "--stop-time", "0.2", "--step-size", "2e-3"),
+        ),
+    ]
+    for run in runs:
+        assert run.wait() == 0, run.text
+    assert "communication steps" in runs[0].text
+    assert f"results in {fine}" in runs[0].text
+    files = {"results.csv", "steps.csv", "summary.json", "results.png"}
+    assert {path.name for path in fine.iterdir()} == files
+    summary = Result.load(coarse).summary
+    assert (summary["order"], summary["estimator"], summary["stop_time"]) == (0, "rich", 0.2)
+    assert not (coarse / "results.png").exists()
+
+    picture = tmp_path / "wheel.png"
+    commands = [
+        start("master_node", "plot", coarse),
+        start("master_node", "plot", fine, "--variable", "wheel.x", "--file", picture),
+        start("master_node", "compare", fine, fine),
+        start("master_node", "compare", coarse, fine, "--rtol", "1e-9", "--atol", "1e-12"),
+        start("master_node", "compare", coarse, fine, "--rtol", "0.5", "--atol", "1.0"),
+        start("master_node", "compare", fine, tmp_path / "nothing"),
+    ]
+    assert [command.wait() for command in commands] == [0, 0, 0, 1, 0, 7]
+    assert (coarse / "results.png").read_bytes().startswith(b"\x89PNG")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "equal bit for bit" in commands[2].text
+    assert "wheel.x" in commands[3].text
+
+
+# ---- A slave dies -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("victim", ["node", "worker"])
+def test_a_killed_slave_ends_the_run(
+    victim: str, start: Start, tmp_path: Path, fmu_dir: Path
+) -> None:
+    """SIGKILL in mid run: slave, t, H and cause in one line, results kept, nothing left running."""
+    file = system_file(tmp_path, fmu_dir / "chassis.fmu", fmu_dir / "wheel.fmu", simulation=FOREVER)
+    master = start("master_node", "run", file, "--output", tmp_path / "out")
+    master.wait_for("simulating")
+    wait_until(lambda: len(Result.load(tmp_path / "out").steps) > 0)
+    node = slave_processes(master)["wheel"]
+    begin = time.monotonic()
+    (node if victim == "node" else worker_of(node)).kill()
+    assert master.wait() == (3 if victim == "node" else 4)
+    assert time.monotonic() - begin < 5.0
+    last = master.text.splitlines()[-1]
+    assert re.match(r"master-node: wheel: \w+ at t=[0-9.e-]+ s, H=[0-9.e-]+ s: ", last), last
+    assert ("died by signal 9" if victim == "node" else "died by SIGKILL") in last
+    result = assert_summary(tmp_path / "out", "failed")
+    assert "wheel" in result.summary["message"]
+    assert repr(float(result.time[-1])) in last
+
+
+def test_a_killed_slave_that_was_started_by_hand(
+    start: Start, tmp_path: Path, endpoint: str
+) -> None:
+    """Its death is seen through its liveliness token; the others are given back."""
+    for name in ("Chassis", "Wheel"):
+        model = EXAMPLES / f"quarter_car.py:{name}"
+        slave = start("slave_node", "serve", model, "--name", name.lower(), "--connect", endpoint)
+        if name == "Chassis":
+            survivor = slave
+    file = system_file(tmp_path, None, None, simulation=FOREVER)
+    master = start("master_node", "run", file, "--listen", endpoint, "--output", tmp_path / "out")
+    master.wait_for("simulating")
+    begin = time.monotonic()
+    slave.send(signal.SIGKILL)
+    assert master.wait() == 3
+    assert time.monotonic() - begin < 3.0
+    assert re.search(r"master-node: wheel: do_step at t=.* s, H=.* s: .*died", master.text)
+    survivor.wait_for("released by")
+
+
+def test_slaves_end_with_a_killed_master(start: Start, tmp_path: Path) -> None:
+    """SIGKILL of the master: what it launched ends with it, and what was flushed is readable."""
+    master = start(
+        *("master_node", "run", system_file(tmp_path, simulation=FOREVER)),
+        *("--output", tmp_path / "out"),
+    )
+    master.wait_for("simulating")
+    wait_until(lambda: len(Result.load(tmp_path / "out").steps) > 0)
+    slaves = list(slave_processes(master).values())
+    slaves += [worker_of(slave) for slave in slaves]
+    assert len(slaves) == 4
+    master.send(signal.SIGKILL)
+    master.wait()
+    assert psutil.wait_procs(slaves, timeout=5.0)[1] == []
+    assert Result.load(tmp_path / "out").summary == {}
+    assert len(Result.load(tmp_path / "out").time) > 1
+
+
+@pytest.mark.parametrize("nap", [30.0, 3600.0])
+def test_a_step_beyond_the_deadline_ends_the_run(nap: float, start: Start, tmp_path: Path) -> None:
+    """A slave that computes for ever: exit code 5 soon after ``step_timeout``, nothing is left."""
+    file = system_file(
+        tmp_path,
+        f"{MODELS}:Sleeper",
+        simulation="stop_time = 0.5\n",
+        bus="step_timeout = 0.6\n",
+        chassis_parameters={"sleeps_at": 0.02, "nap": nap, "bed": str(tmp_path / "asleep")},
+    )
+    master = start("master_node", "run", file, "--output", tmp_path / "out")
+    master.wait_for("simulating")
+    wait_until((tmp_path / "asleep").exists)
+    begin = time.monotonic()
+    assert master.wait() == 5
+    assert time.monotonic() - begin < 5.0
+    last = master.text.splitlines()[-1]
+    assert re.match(r"master-node: chassis: do_step at t=.* s, H=.* s: .*0\.6 s", last), last
+    assert assert_summary(tmp_path / "out", "failed").time[-1] <= 0.02
+
+
+# ---- The end on request -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("where", ["launched", "in process", "in a long step"])
+def test_ctrl_c_and_sigterm(
+    number: signal.Signals, where: str, start: Start, tmp_path: Path
+) -> None:
+    """Exit code 130 within a second, results closed and marked, even when a slave is in a step."""
+    sleepy = where == "in a long step"
+    asleep = tmp_path / "asleep"
+    file = system_file(
+        tmp_path,
+        f"{MODELS}:Sleeper" if sleepy else "quarter_car.py:Chassis",
+        simulation=FOREVER,
+        chassis_parameters={"sleeps_at": 0.02, "nap": 60.0, "bed": str(asleep)} if sleepy else {},
+    )
+    options = ["--in-process"] if where == "in process" else []
+    master = start("master_node", "run", file, "--output", tmp_path / "out", *options)
+    master.wait_for("simulating")
+    if sleepy:
+        wait_until(asleep.exists)
+    else:
+        wait_until(lambda: len(Result.load(tmp_path / "out").steps) > 0)
+    begin = time.monotonic()
+    master.send(number)
+    assert master.wait() == 130, master.text
+    assert time.monotonic() - begin < AT_ONCE
+    assert "interrupted at t=" in master.text.splitlines()[-1]
+    assert "Traceback" not in master.text
+    assert_summary(tmp_path / "out", "interrupted")
+
+
+def test_ctrl_c_before_the_first_step(start: Start, tmp_path: Path, endpoint: str) -> None:
+    """While slaves are waited for there is nothing to keep, and nothing is left running."""
+    file = system_file(tmp_path, None)
+    master = start("master_node", "run", file, "--listen", endpoint, "--output", tmp_path / "out")
+    host, port = endpoint.removeprefix("tcp/").split(":")
+
+    def listens() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex((host, int(port))) == 0
+
+    wait_until(listens)
+    begin = time.monotonic()
+    master.send(signal.SIGINT)
+    assert master.wait() == 130, master.text
+    assert time.monotonic() - begin < AT_ONCE
+    assert "interrupted before the first step" in master.text
+
+
+# ---- Who holds a slave, and which slave is meant ------------------------------------------------
+
+
+def test_a_second_master_is_refused_and_the_first_goes_on(start: Start, tmp_path: Path) -> None:
+    """Exit code 6 naming the holder; afterwards the slaves serve another master."""
+    where = endpoints(2)
+    slaves = []
+    for name, endpoint in zip(("Chassis", "Wheel"), where, strict=True):
+        model = EXAMPLES / f"quarter_car.py:{name}"
+        slaves.append(
+            start("slave_node", "serve", model, "--name", name.lower(), "--listen", endpoint)
+        )
+    connect = [word for endpoint in where for word in ("--connect", endpoint)]
+    file = system_file(tmp_path, None, None, simulation=FOREVER)
+    common = ("master_node", "run", file, "--no-plot", *connect, "--output")
+    first = start(*common, tmp_path / "first")
+    first.wait_for("simulating")
+    second = start(*common, tmp_path / "second")
+    assert second.wait() == 6
+    assert re.search(
+        rf"master-node: chassis: claim: busy: held by run \w+ on .* \(pid {first.process.pid}\)",
+        second.text,
+    ), second.text
+    rows = len(Result.load(tmp_path / "first").time)
+    wait_until(lambda: len(Result.load(tmp_path / "first").time) > rows)
+    first.send(signal.SIGINT)
+    assert first.wait() == 130
+    third = start(*common, tmp_path / "third", "--stop-time", "0.1")
+    assert third.wait() == 0, third.text
+    assert_summary(tmp_path / "first", "interrupted")
+    assert_summary(tmp_path / "third", "completed")
+
+
+def test_two_slaves_of_one_name_are_refused(start: Start, tmp_path: Path, endpoint: str) -> None:
+    """Exit code 6 naming both by host and process id, before anything is stepped.
+
+    The two are there first and connect within a fraction of a second; the master still waits
+    for the wheel that it launches.
+    """
+    model = EXAMPLES / "quarter_car.py:Chassis"
+    twins = [
+        start("slave_node", "serve", model, "--name", "chassis", "--connect", endpoint)
+        for _ in range(2)
+    ]
+    for twin in twins:
+        twin.wait_for("ready")
+    master = start(
+        *("master_node", "run", system_file(tmp_path, None), "--listen", endpoint),
+        *("--output", tmp_path / "out"),
+    )
+    assert master.wait() == 6
+    last = master.text.splitlines()[-1]
+    assert "2 instances of 'chassis': " in last
+    for twin in twins:
+        assert f"{socket.gethostname()}/{twin.process.pid}" in last
+    assert not (tmp_path / "out" / "results.csv").exists()
+
+
+def test_a_slave_that_never_appears(start: Start, tmp_path: Path, endpoint: str) -> None:
+    """Exit code 3 after the stated time, naming who is missing and who was found."""
+    model = EXAMPLES / "quarter_car.py:Chassis"
+    chassis = start("slave_node", "serve", model, "--name", "chassis", "--connect", endpoint)
+    chassis.wait_for("ready")
+    begin = time.monotonic()
+    master = start(
+        *("master_node", "run", system_file(tmp_path, None, None), "--listen", endpoint),
+        *("--timeout", "1", "--output", tmp_path / "out"),
+    )
+    assert master.wait() == 3
+    assert 1.0 < time.monotonic() - begin < 8.0
+    assert (
+        "master-node: wheel: discovery: did not appear within 1 s; found on the bus: chassis; "
+        "start it with `slave-node serve" in master.text
+    )
+
+
+# ---- Bad input ----------------------------------------------------------------------------------
+
+
+def test_a_port_in_use(start: Start, tmp_path: Path) -> None:
+    """Exit code 2 with the address and the remedy."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        file = system_file(tmp_path, None)
+        master = start(
+            "master_node", "run", file, "--listen", endpoint, "--output", tmp_path / "out"
+        )
+        assert master.wait() == 2
+    assert f"cannot open the bus at {endpoint}" in master.text
+    assert "another process may use the port" in master.text
+
+
+def _missing(path: Path) -> None:
+    """Nothing there."""
+
+
+def _corrupt(path: Path) -> None:
+    """A zip that was cut off."""
+    path.write_bytes(b"PK\x03\x04 and then nothing of use")
+
+
+def _empty(path: Path) -> None:
+    path.touch()
+
+
+@pytest.mark.parametrize("make", [_missing, _corrupt, _empty])
+@pytest.mark.parametrize("options", [[], ["--in-process"]])
+def test_an_fmu_that_cannot_be_used(
+    make: Callable[[Path], None], options: list[str], start: Start, tmp_path: Path
+) -> None:
+    """Exit code 2 with slave and path, launched as in process; the other slave is ended too."""
+    fmu = tmp_path / "broken.fmu"
+    make(fmu)
+    master = start(
+        *("master_node", "run", system_file(tmp_path, fmu), "--output", tmp_path / "out"), *options
+    )
+    assert master.wait() == 2, master.text
+    last = master.text.splitlines()[-1]
+    assert last.startswith("master-node: chassis: ")
+    assert "broken.fmu" in last
+    assert "Traceback" not in master.text
+
+
+def test_a_misspelt_variable(start: Start, tmp_path: Path) -> None:
+    """Exit code 2 with the file, the connection and the nearest name; no step is taken."""
+    file = system_file(tmp_path, connections=[*DISPLACEMENT[:3], ("wheel.v", "chassis.vw")])
+    master = start("master_node", "run", file, "--output", tmp_path / "out")
+    assert master.wait() == 2
+    assert master.text.splitlines()[-1] == (
+        f"master-node: {file}: [[connections]] number 4: to = 'chassis.vw': "
+        "chassis has no variable 'vw'; did you mean 'v_w' or 'v'?"
+    )
+    assert not (tmp_path / "out" / "results.csv").exists()
+
+
+def test_an_output_directory_that_cannot_be_written(start: Start, tmp_path: Path) -> None:
+    """Exit code 7 with the path, before a slave is started."""
+    (tmp_path / "file").touch()
+    begin = time.monotonic()
+    master = start("master_node", "run", system_file(tmp_path), "--output", tmp_path / "file/out")
+    assert master.wait() == 7
+    assert str(tmp_path / "file") in master.text
+    assert time.monotonic() - begin < 10.0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--order", "4"], "--order"),
+        (["--step-size", "0"], "initial_step_size = 0.0"),
+        (["--stop-time", "-1"], "stop_time -1 must be after start_time 0"),
+        (["--relative-tolerance", "-1"], "relative_tolerance = -1.0"),
+        (["--estimator", "richardson"], "'rich', 'mod' or 'none'"),
+        (["--listen", "7447"], "'7447' is not an endpoint"),
+        (["--listen", "tcp/0.0.0.0:7447"], "--insecure"),
+    ],
+)
+def test_a_wrong_command_line(words: list[str], message: str, start: Start, tmp_path: Path) -> None:
+    """Exit code 2, and what would be right."""
+    file = system_file(tmp_path)
+    master = start("master_node", "run", file, "--output", tmp_path / "out", *words)
+    assert master.wait() == 2
+    assert message in master.text
+    assert "Traceback" not in master.text
