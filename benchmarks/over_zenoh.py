@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.interleaved import Interleaved
@@ -37,10 +38,12 @@ def run() -> list[tuple[str, str, str, str]]:
             for pending in [caller.send(b"") for caller in callers]:
                 pending.result()
 
-        rows = []
-        for estimator, order in (("mod", 1), ("rich", 1), ("mod", 3), ("rich", 3)):
-            rows.append(_measure(fan_out, estimator, order))
-        return rows
+        configurations = [("mod", 1), ("rich", 1), ("mod", 3), ("rich", 3)]
+        return [
+            _measure(fan_out, estimator, order, pin=pin)
+            for pin in (False, True)
+            for estimator, order in configurations
+        ]
     finally:
         for echo in echoes:
             echo.terminate()
@@ -48,9 +51,10 @@ def run() -> list[tuple[str, str, str, str]]:
         bus.close()
 
 
-def _measure(fan_out: object, estimator: str, order: int) -> tuple[str, str, str, str]:
-    assert callable(fan_out)
-    car = system(estimator=estimator, order=order, stop_time=30.0)
+def _measure(
+    fan_out: Callable[[], None], estimator: str, order: int, *, pin: bool
+) -> tuple[str, str, str, str]:
+    car = system(estimator=estimator, order=order, stop_time=30.0).with_bus(pin=pin)
     timing = Interleaved(fan_out)
     with (
         tempfile.TemporaryDirectory() as logs,
@@ -62,7 +66,8 @@ def _measure(fan_out: object, estimator: str, order: int) -> tuple[str, str, str
     requests = {s.requests / attempts for s in statistics.slaves.values()}
     attempt, empty = timing.medians()
     return (
-        f"EST_{estimator}, k = {order} ({'/'.join(f'{r:g}' for r in requests)} requests a slave)",
+        f"EST_{estimator}, k = {order}{', --pin' if pin else ''}"
+        f" ({'/'.join(f'{r:g}' for r in requests)} requests a slave)",
         f"{attempt:.0f} us",
         f"{empty:.0f} us",
         f"{attempt / empty:.2f}",

@@ -59,6 +59,9 @@ def run(  # noqa: PLR0917  options of the command line
     timeout: Annotated[
         float | None, typer.Option(help="How long to wait for slaves to appear [s].")
     ] = None,
+    pin: Annotated[
+        bool, typer.Option("--pin", help="Keep each launched slave on one processor.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
 ) -> None:
@@ -88,6 +91,7 @@ def run(  # noqa: PLR0917  options of the command line
             listen=tuple(listen or ()),
             insecure=insecure,
             discovery_timeout=timeout,
+            pin=pin,
         )
     )
     try:

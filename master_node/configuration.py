@@ -214,6 +214,9 @@ class BusSettings(_Table):
         insecure: allow addresses other than loopback.
         discovery_timeout: how long to wait for slaves to appear [s].
         step_timeout: how long one request may take [s].
+        pin: keep the node and the worker of each launched slave on one processor, so that a
+            request is handed over without waking another one. For small models; a model with
+            threads of its own would have only that processor.
     """
 
     listen: tuple[StrictStr, ...] = ()
@@ -221,6 +224,7 @@ class BusSettings(_Table):
     insecure: StrictBool = False
     discovery_timeout: Positive = 30.0
     step_timeout: Positive = 60.0
+    pin: StrictBool = False
 
 
 class System(_Table):

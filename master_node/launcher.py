@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from secrets import token_hex
 from time import monotonic
+from typing import Self
 
 from protocol.errors import ConfigurationError, DoublestepError, ModelError, SlaveLostError
 from protocol.keys import SlaveKey
@@ -29,12 +30,21 @@ class Launcher:
     Args:
         endpoint: of the master, to which the slaves connect.
         log_directory: existing; gets ``NAME.log`` of each slave.
+        pin: give each slave one processor of its own, in turn, where the platform can.
     """
 
-    def __init__(self, endpoint: str, log_directory: Path) -> None:
+    def __init__(self, endpoint: str, log_directory: Path, *, pin: bool = False) -> None:
         self._endpoint = endpoint
+        self._processors = _processors() if pin else []
         self._log_directory = log_directory
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """End all, at once after Ctrl-C: a slave that is still loading would not hear it."""
+        self.stop(at_once=kind is not None and issubclass(kind, KeyboardInterrupt))
 
     def launch(self, name: str, model: str, base: Path) -> SlaveKey:
         """Start a slave; its address on the bus, where it will appear.
@@ -52,6 +62,9 @@ class Launcher:
         }
         command += [word for option in options.items() for word in option]
         command.append("--stay-with-parent")
+        if self._processors:
+            processor = self._processors[len(self._processes) % len(self._processors)]
+            command += ["--processor", str(processor)]
         try:
             with self._log(name).open("wb") as log:
                 self._processes[name] = subprocess.Popen(
@@ -136,6 +149,11 @@ class Launcher:
             words = errors[-1:] or lines[-_TAIL_LINES:]
             return " | ".join(word.removeprefix("slave-node: ") for word in words) or "nothing"
         return "nothing"
+
+
+def _processors() -> list[int]:
+    """The processors that this process may use; none where the platform does not tell."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 def _environment() -> dict[str, str]:

@@ -19,7 +19,7 @@ from protocol.errors import DoublestepError, SlaveLostError
 from protocol.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey
 from protocol.slave import StartValue
 
-_ADMINISTRATION_TIME = 10.0
+_CLAIM_TIME = 90.0  # a slave whose worker died loads its model again first
 _GOODBYE_TIME = 0.3
 _LIVELINESS_TIME = 0.5
 _ATTEMPTS = 3
@@ -57,7 +57,7 @@ class RemoteSlave:
             "host": socket.gethostname(),
             "pid": os.getpid(),
         }
-        answer = bus.caller(key.verb(CLAIM), _ADMINISTRATION_TIME).request(encode_map(claim))
+        answer = bus.caller(key.verb(CLAIM), _CLAIM_TIME).request(encode_map(claim))
         self._epoch = int(decode_map(answer)["epoch"])
 
     @property

@@ -22,7 +22,14 @@ from master_node.remote_slave import RemoteSlave, slave_status
 from master_node.slave_link import LocalSlave, SlaveLink
 from protocol.bus import Bus
 from protocol.calls import Describe
-from protocol.errors import ConfigurationError, DoublestepError, ProtocolError, SlaveLostError
+from protocol.errors import (
+    ConfigurationError,
+    DeadlineError,
+    DoublestepError,
+    InterruptedRunError,
+    ProtocolError,
+    SlaveLostError,
+)
 from protocol.keys import SlaveKey, alive_master, alive_slaves
 from protocol.slave import SlaveDescription
 from protocol.zenoh_bus import Endpoints, ZenohBus
@@ -107,8 +114,7 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
         stack.callback(bus.close)
         run = token_hex(4)
         bus.announce(alive_master(run))
-        launcher = Launcher(private, log_directory)
-        stack.callback(launcher.stop)
+        launcher = stack.enter_context(Launcher(private, log_directory, pin=system.bus.pin))
         keys = {
             name: launcher.launch(name, str(system.slaves[name].model), system.base)
             for name in system.slaves
@@ -129,11 +135,13 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
         slaves = Slaves(links, _describe(links), launcher)
         try:
             yield slaves
-        except DoublestepError as error:
-            raise slaves.explain(error) from error.__cause__
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, InterruptedRunError):
             launcher.stop(at_once=True)
             raise
+        except DoublestepError as error:
+            if isinstance(error, DeadlineError) and error.slave in keys:
+                remotes[keys[error.slave].alive].abort()
+            raise slaves.explain(error) from error.__cause__
 
 
 def _describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:

@@ -64,6 +64,7 @@ def serve(  # noqa: PLR0917  options of the command line
     ] = Path(),
     instance: Annotated[str, typer.Option(hidden=True)] = "",
     stay_with_parent: Annotated[bool, typer.Option(hidden=True)] = False,
+    processor: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
     """Load MODEL and serve it until SIGTERM or Ctrl-C."""
     from protocol.zenoh_bus import Endpoints, ZenohBus  # noqa: PLC0415  keeps the worker light
@@ -82,6 +83,8 @@ def serve(  # noqa: PLR0917  options of the command line
     reference = ModelReference(
         model, base.absolute(), key.name, _parameters(parameter or []), fmi_logging
     )
+    if processor is not None:
+        os.sched_setaffinity(0, {processor})  # type: ignore[attr-defined,unused-ignore]  # Linux
     worker = WorkerProcess(reference)
     bus: ZenohBus | None = None
     node: SlaveNode | None = None

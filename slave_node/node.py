@@ -185,6 +185,7 @@ class SlaveNode:
                 epoch = self._claims.claim(holder)
             if new:
                 log.info("claimed by %s", holder)
+                self._look_after(epoch, self._orphan_time)  # a claim may arrive after its run
         except DoublestepError as error:
             log.warning("claim refused: %s", error)
             return encode_error_map(error.located(slave=self._key.name, phase=CLAIM))
@@ -245,8 +246,11 @@ class SlaveNode:
         if alive or holder is None or key != alive_master(holder.run):
             return
         log.warning("the master is gone: %s", holder)
-        wait = 0.0 if _has_ended(holder) else self._orphan_time
-        timer = threading.Timer(wait, self._reset_orphan, (self._claims.epoch,))
+        self._look_after(self._claims.epoch, 0.0 if _has_ended(holder) else self._orphan_time)
+
+    def _look_after(self, epoch: int, wait: float) -> None:
+        """See after ``wait`` seconds whether the master of ``epoch`` is there."""
+        timer = threading.Timer(wait, self._reset_orphan, (epoch,))
         timer.daemon = True
         timer.start()
 

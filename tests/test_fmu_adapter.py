@@ -412,14 +412,14 @@ def packed(path: Path, entries: Entries | list[tuple[str, bytes]]) -> Path:
     return path
 
 
-def refusal(fmu: Path, tmp_path: Path) -> str:
+def refusal(fmu: Path, tmp_path: Path, bound: float = 1.0) -> str:
     """Why an FMU is refused: at once, by both ways in, before anything is written."""
     scratch = tmp_path / "scratch"
     scratch.mkdir(exist_ok=True)
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(ModelError) as caught:
         extract(fmu, scratch)
-    assert time.perf_counter() - begin < 0.5
+    assert time.process_time() - begin < bound
     assert list(scratch.iterdir()) == []
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted({fmu.name, "scratch"})
     with pytest.raises(ModelError):
@@ -654,7 +654,7 @@ def test_document_types_are_refused(tmp_path: Path, kind: str, encoding: str) ->
         f'<fmiModelDescription fmiVersion="2.0" modelName="&i;"/>'
     )
     fmu = packed(tmp_path / "a.fmu", {"modelDescription.xml": xml.encode(encoding)})
-    assert "declares a document type" in refusal(fmu, tmp_path)
+    assert "declares a document type" in refusal(fmu, tmp_path, bound=0.05)
 
 
 @pytest.mark.parametrize("encoding", ["utf-7", "utf-32", "cp037", "no-such-encoding"])

@@ -23,6 +23,7 @@ import psutil
 import pytest
 
 from master_node import Result, load_system, simulate
+from protocol.errors import ResultsError
 from tests.quarter_car_case import DISPLACEMENT, EXAMPLES, global_errors
 
 pytestmark = [
@@ -32,9 +33,6 @@ pytestmark = [
 
 BOUND = 30.0
 """No wait in these tests is longer [s]."""
-
-AT_ONCE = 1.0
-"""What an end on request may take [s]."""
 
 MODELS = Path(__file__).parent / "quarter_car_models.py"
 FOREVER = "stop_time = 1e6\nlargest_step_size = 1e-3\nsmallest_step_size = 1e-9\n"
@@ -162,6 +160,24 @@ def endpoints(number: int) -> list[str]:
     for probe in probes:
         probe.close()
     return [f"tcp/127.0.0.1:{port}" for port in ports]
+
+
+def has_stepped(directory: Path) -> bool:
+    """Whether steps have reached the disk."""
+    try:
+        return len(Result.load(directory).steps) > 0
+    except ResultsError:  # not begun
+        return False
+
+
+def at_once() -> float:
+    """What an end on request may take: a second [s], and more where the machine is busy.
+
+    A process that does nothing takes 0.1 s at most on a machine that is not.
+    """
+    begin = time.monotonic()
+    subprocess.run([sys.executable, "-c", "pass"], check=True, timeout=BOUND)
+    return max(1.0, (time.monotonic() - begin) / 0.1)
 
 
 def slave_processes(master: Command) -> dict[str, psutil.Process]:
@@ -299,18 +315,19 @@ def test_a_killed_slave_ends_the_run(
     file = system_file(tmp_path, fmu_dir / "chassis.fmu", fmu_dir / "wheel.fmu", simulation=FOREVER)
     master = start("master_node", "run", file, "--output", tmp_path / "out")
     master.wait_for("simulating")
-    wait_until(lambda: len(Result.load(tmp_path / "out").steps) > 0)
+    wait_until(lambda: has_stepped(tmp_path / "out"))
     node = slave_processes(master)["wheel"]
     begin = time.monotonic()
     (node if victim == "node" else worker_of(node)).kill()
     assert master.wait() == (3 if victim == "node" else 4)
     assert time.monotonic() - begin < 5.0
     last = master.text.splitlines()[-1]
-    assert re.match(r"master-node: wheel: \w+ at t=[0-9.e-]+ s, H=[0-9.e-]+ s: ", last), last
+    assert re.match(r"master-node: wheel: do_step at t=[0-9.e-]+ s, H=[0-9.e-]+ s: ", last), last
     assert ("died by signal 9" if victim == "node" else "died by SIGKILL") in last
     result = assert_summary(tmp_path / "out", "failed")
-    assert "wheel" in result.summary["message"]
-    assert repr(float(result.time[-1])) in last
+    assert result.summary["message"].startswith("wheel: ")
+    (told,) = re.findall(r" at t=(\S+) s, ", last)
+    assert result.time[-1] <= float(told) < result.time[-1] + 2e-3
 
 
 def test_a_killed_slave_that_was_started_by_hand(
@@ -340,7 +357,7 @@ def test_slaves_end_with_a_killed_master(start: Start, tmp_path: Path) -> None:
         *("--output", tmp_path / "out"),
     )
     master.wait_for("simulating")
-    wait_until(lambda: len(Result.load(tmp_path / "out").steps) > 0)
+    wait_until(lambda: has_stepped(tmp_path / "out"))
     slaves = list(slave_processes(master).values())
     slaves += [worker_of(slave) for slave in slaves]
     assert len(slaves) == 4
@@ -395,11 +412,12 @@ def test_ctrl_c_and_sigterm(
     if sleepy:
         wait_until(asleep.exists)
     else:
-        wait_until(lambda: len(Result.load(tmp_path / "out").steps) > 0)
+        wait_until(lambda: has_stepped(tmp_path / "out"))
     begin = time.monotonic()
     master.send(number)
     assert master.wait() == 130, master.text
-    assert time.monotonic() - begin < AT_ONCE
+    taken = time.monotonic() - begin
+    assert taken < at_once()
     assert "interrupted at t=" in master.text.splitlines()[-1]
     assert "Traceback" not in master.text
     assert_summary(tmp_path / "out", "interrupted")
@@ -419,7 +437,8 @@ def test_ctrl_c_before_the_first_step(start: Start, tmp_path: Path, endpoint: st
     begin = time.monotonic()
     master.send(signal.SIGINT)
     assert master.wait() == 130, master.text
-    assert time.monotonic() - begin < AT_ONCE
+    taken = time.monotonic() - begin
+    assert taken < at_once()
     assert "interrupted before the first step" in master.text
 
 

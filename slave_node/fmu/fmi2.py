@@ -263,7 +263,7 @@ class Fmi2Slave(Slave):
     ) -> StepResult:
         """See `Slave`."""
         status = self._do_step(communication_point, step_size, no_set_state_prior)
-        if status <= _WARNING:
+        if 0 <= status <= _WARNING:
             return StepResult(_STEP_OK, communication_point + step_size)
         if status == _DISCARD:
             return self._discarded()
