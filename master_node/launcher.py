@@ -6,6 +6,7 @@ import os
 import shlex
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -38,6 +39,10 @@ class Launcher:
         self._processors = _processors() if pin else []
         self._log_directory = log_directory
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        # What a slave that is killed leaves behind goes with it.
+        self._scratch = tempfile.TemporaryDirectory(
+            prefix="doublestep-", ignore_cleanup_errors=True
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -73,7 +78,7 @@ class Launcher:
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,  # Ctrl-C is for the master, who tells the slaves
-                    env=_environment(),
+                    env=_environment(self._scratch.name),
                 )
         except OSError as error:
             raise ConfigurationError(
@@ -132,6 +137,7 @@ class Launcher:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait(_KILL_TIME)
+        self._scratch.cleanup()
 
     @property
     def process_ids(self) -> Mapping[str, int]:
@@ -156,5 +162,10 @@ def _processors() -> list[int]:
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
-def _environment() -> dict[str, str]:
-    return {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+def _environment(scratch: str) -> dict[str, str]:
+    return {
+        **os.environ,
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        "TMPDIR": scratch,
+    }

@@ -6,7 +6,7 @@ import os
 import socket
 from collections.abc import Sequence
 
-from protocol.bus import Bus, PendingReply
+from protocol.bus import Bus, Caller, PendingReply
 from protocol.calls import Call, Reply
 from protocol.codec import (
     decode_map,
@@ -47,11 +47,13 @@ class RemoteSlave:
     def __init__(self, bus: Bus, key: SlaveKey, run: str, step_timeout: float) -> None:
         self._bus = bus
         self._key = key
-        self._execute = bus.caller(key.verb(EXECUTE), step_timeout)
+        self._step_timeout = step_timeout
+        self._execute = self._caller()
         self._sequence = 0
         self._calls: Sequence[Call] = ()
         self._payload = b""
         self._pending: PendingReply | None = None
+        self._gone = ""
         claim: dict[str, StartValue] = {
             "run": run,
             "host": socket.gethostname(),
@@ -59,6 +61,9 @@ class RemoteSlave:
         }
         answer = bus.caller(key.verb(CLAIM), _CLAIM_TIME).request(encode_map(claim))
         self._epoch = int(decode_map(answer)["epoch"])
+
+    def _caller(self) -> Caller:
+        return self._bus.caller(self._key.verb(EXECUTE), self._step_timeout)
 
     @property
     def key(self) -> SlaveKey:
@@ -88,6 +93,9 @@ class RemoteSlave:
         for attempt in range(_ATTEMPTS):
             if not self._bus.alive(self._key.alive, _LIVELINESS_TIME):
                 break
+            self._execute = self._caller()  # the old one may have been cancelled
+            if self._gone:
+                break
             try:
                 return self._execute.request(self._payload)
             except SlaveLostError:
@@ -95,11 +103,17 @@ class RemoteSlave:
                     raise
         raise SlaveLostError(
             "its process died or the connection to it was lost",
+            slave=self._gone,
             remedy="see the slave's log for the reason",
         )
 
     def lost(self) -> None:
         """Its liveliness token went away: let pending waits end now."""
+        self._execute.cancel()
+
+    def abandon(self, gone: str) -> None:
+        """Slave ``gone`` does not come back, and ends the run: wait for this one no more."""
+        self._gone = gone
         self._execute.cancel()
 
     def release(self) -> None:

@@ -76,8 +76,8 @@ class SlaveGroup:
             statistics.requests += 1
             statistics.compute_time += reply.compute_time
             if reply.error is not None:
-                error = self._located(reply.error, index, programs[index])
-                error.located(time=time, step_size=step_size)
+                self._located(reply.error, index, programs[index])
+                reply.error.located(time=time, step_size=step_size)
         self.wait_time += perf_counter() - begin
         self.round_trips += 1
         if failure is not None:

@@ -35,6 +35,7 @@ from protocol.slave import SlaveDescription
 from protocol.zenoh_bus import Endpoints, ZenohBus
 
 _POLL_TIME = 0.02
+_RETURN_TIME = 0.5
 _DEATH_TIME = 1.0
 _LIVELINESS_TIME = 1.0
 
@@ -132,6 +133,7 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
             links[name] = remotes[keys[name].alive] = remote
             stack.callback(remote.release)
         presence.on_loss(remotes)
+        stack.callback(presence.on_loss, {})
         slaves = Slaves(links, _describe(links), launcher)
         try:
             yield slaves
@@ -197,11 +199,28 @@ class _Presence:
             (self._alive.add if alive else self._alive.discard)(slave)
             self._changed.notify_all()
         if not alive and key in self._remotes:
-            self._remotes[key].lost()
+            self._lost(slave)
 
     def on_loss(self, remotes: Mapping[str, RemoteSlave]) -> None:
         """From now on tell these slaves' links when their token goes away."""
-        self._remotes = remotes
+        with self._changed:
+            self._remotes = remotes
+            lost = [remote.key for remote in remotes.values() if remote.key not in self._alive]
+        for slave in lost:
+            self._lost(slave)
+
+    def _lost(self, slave: SlaveKey) -> None:
+        self._remotes[slave.alive].lost()
+        timer = threading.Timer(_RETURN_TIME, self._abandon, (slave,))
+        timer.daemon = True
+        timer.start()
+
+    def _abandon(self, gone: SlaveKey) -> None:
+        """A slave that stays away ends the run, however long the steps of the others take."""
+        with self._changed:
+            remotes = [] if gone in self._alive else list(self._remotes.values())
+        for remote in remotes:
+            remote.abandon(gone.name)
 
     def wait(
         self, names: list[str], keys: Mapping[str, SlaveKey], launcher: Launcher, timeout: float

@@ -32,6 +32,7 @@ _FIRST_CONNECTION_MS = 100  # `open` waits so long for it, often in full; the de
 _TIMEOUT_PAYLOAD = b"Timeout"
 _MAX_TOKENS = 4096
 _CLOSE_TIME = 1.0
+_REQUESTS_A_TOKEN = 512
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,17 +215,37 @@ class _ZenohCaller(Caller):
         self._querier = querier
         self.key = key
         self.timeout = timeout
-        self._token = zenoh.CancellationToken()
+        self._lock = threading.Lock()
+        self._cancelled = False
+        self._tokens = [zenoh.CancellationToken()]
+        self._left = _REQUESTS_A_TOKEN
 
     def send(self, payload: bytes) -> PendingReply:
+        self._left -= 1
+        if self._left == 0:
+            self._renew_token()
         try:
-            channel = self._querier.get(payload=payload, cancellation_token=self._token)
+            channel = self._querier.get(payload=payload, cancellation_token=self._tokens[-1])
         except zenoh.ZError as error:
             raise SlaveLostError(f"cannot ask {self.key}: {_first_line(error)}") from error
         return _ZenohReply(channel, self)
 
+    def _renew_token(self) -> None:
+        """A token remembers all queries it was given to; the last two serve what is pending."""
+        with self._lock:
+            self._left = _REQUESTS_A_TOKEN
+            self._tokens = [self._tokens[-1], zenoh.CancellationToken()]
+            if self._cancelled:
+                self._cancel_tokens()
+
     def cancel(self) -> None:
-        self._token.cancel()  # type: ignore[no-untyped-call]  # missing in zenoh's stub
+        with self._lock:
+            self._cancelled = True
+            self._cancel_tokens()
+
+    def _cancel_tokens(self) -> None:
+        for token in self._tokens:
+            token.cancel()  # type: ignore[no-untyped-call]  # missing in zenoh's stub
 
 
 class _ZenohReply(PendingReply):

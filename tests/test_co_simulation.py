@@ -6,6 +6,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +162,7 @@ def test_the_tolerance_controls_the_error(estimator: str, fmu_dir: Path) -> None
         errors.append(global_errors(completed(run_slaves(system))).mean())
     slope = np.polyfit(np.log10(tolerances), np.log10(errors), 1)[0]
     assert 0.75 < slope < 1.25
-    assert all(3.0 < a / b < 30.0 for a, b in zip(errors, errors[1:], strict=False))
+    assert all(3.0 < a / b < 30.0 for a, b in pairwise(errors))
 
 
 def test_python_models_and_fmus_agree(fmu_dir: Path) -> None:
@@ -259,7 +260,7 @@ def test_saved_states_are_few_and_all_freed(estimator: str) -> None:
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_step_sizes_follow_the_controller(estimator: str, fmu_dir: Path) -> None:
-    """Every H is the one that the paper's formula makes of the attempt before it, with P = k + 2."""
+    """Every H is what the paper's formula makes of the attempt before it, with P = k + 2."""
     result = completed(run_slaves(fmu_car(fmu_dir, estimator=estimator, order=1)))
     assert_controlled(result, exponent=3)
 
@@ -286,7 +287,7 @@ def assert_controlled(result: Result, exponent: int) -> None:
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("k", range(3))
 def test_displacement_force_has_one_order_less(estimator: str, k: int, fmu_dir: Path) -> None:
-    """The wheel's force contains its inputs, so P = k + 1; the solution is that of the other cut."""
+    """The wheel's force contains its inputs, so P = k + 1; the car moves as with the other cut."""
     system = car(
         "chassis_force.fmu",
         "wheel_force.fmu",
@@ -311,7 +312,7 @@ def test_displacement_force_has_one_order_less(estimator: str, k: int, fmu_dir: 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("k", range(4))
 def test_without_a_history_the_order_grows(estimator: str, k: int) -> None:
-    """``initial_history = "none"``: as many points as there are, and order k as soon as it can be."""
+    """``initial_history = "none"``: order k as soon as there are points enough for it."""
     system = car(estimator=estimator, order=k, initial_history="none", stop_time=0.05)
     result = completed(run_slaves(system, exact_car()))
     orders = accepted(result)["order"].tolist()
@@ -571,7 +572,7 @@ def clock(**simulation: Any) -> Result:
 def test_fixed_steps_that_divide_the_time_are_all_of_one_size(
     start: float, n: int, step_size: float
 ) -> None:
-    """n steps of H from start to start + n H are n steps, however they are rounded."""
+    """From start to start + n H there are n steps of H, however they are rounded."""
     stop = start + n * step_size
     result = clock(start_time=start, stop_time=stop, initial_step_size=step_size, estimator="none")
     assert len(result.time) == n + 1

@@ -155,7 +155,7 @@ def test_a_file_is_read_as_it_is_written(tmp_path: Path) -> None:
 
 
 def test_defaults_are_those_that_the_documentation_names(tmp_path: Path) -> None:
-    """The paper's ranges for the controller; the slaves' tolerance two orders below the master's."""
+    """The controller within the paper's ranges; slaves integrate two orders below RTOL."""
     settings = load_system(written(tmp_path, SYSTEM)).simulation
     assert settings.start_time == 0.0
     assert settings.step_size == pytest.approx(4e-3)
@@ -175,16 +175,16 @@ def test_defaults_are_those_that_the_documentation_names(tmp_path: Path) -> None
 def test_default_step_sizes_keep_each_others_bounds(
     stop: float, smallest: float | None, largest: float | None
 ) -> None:
-    """smallest <= H_0 <= largest whatever of them is given, or the message names what is."""
+    """H_0 lies between the bounds whichever of them is given, or the message names what is."""
     bounds = {"smallest_step_size": smallest, "largest_step_size": largest}
     given_bounds = {name: value for name, value in bounds.items() if value is not None}
     try:
         settings = SimulationSettings(stop_time=stop, **given_bounds)
     except ValueError as error:
-        assert smallest is not None  # noqa: PT017
-        assert largest is not None  # noqa: PT017
-        assert smallest > largest  # noqa: PT017
-        assert "smallest_step_size" in str(error)  # noqa: PT017
+        assert smallest is not None
+        assert largest is not None
+        assert smallest > largest
+        assert "smallest_step_size" in str(error)  # noqa: PT017  most draws raise nothing
         return
     assert settings.smallest <= settings.step_size
     if largest is not None:

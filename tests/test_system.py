@@ -63,7 +63,7 @@ TWO = {"a": described("u w", "y z"), "b": described("u", "y")}
 
 
 def test_indices_of_the_quarter_car(tmp_path: Any) -> None:
-    """u = y[source], with the outputs in the order of the slaves and of their variables."""
+    """The inputs are y[source], outputs in the order of the slaves and of their variables."""
     system = car()
     descriptions = {
         name: load_slave(str(slave.model), system.base, name, tmp_path).description
