@@ -75,14 +75,18 @@ class RemoteSlave:
         self._sequence += 1
         self._calls = calls
         self._payload = encode_request(self._epoch, self._sequence, encode_program(calls))
-        self._pending = self._execute.send(self._payload)
+        try:
+            self._pending = self._execute.send(self._payload)
+        except SlaveLostError:
+            self._pending = None
 
     def finish(self) -> Reply:
         """See `SlaveLink`."""
-        assert self._pending is not None
         try:
-            data = self._pending.result()
+            data = self._pending.result() if self._pending else None
         except SlaveLostError:
+            data = None
+        if data is None:
             data = self._ask_again()
         return decode_reply(self._calls, data)
 

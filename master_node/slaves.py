@@ -198,20 +198,21 @@ class _Presence:
         with self._changed:
             (self._alive.add if alive else self._alive.discard)(slave)
             self._changed.notify_all()
-        if not alive and key in self._remotes:
-            self._lost(slave)
+        remote = self._remotes.get(key)
+        if remote is not None and not alive:
+            self._lost(remote)
 
     def on_loss(self, remotes: Mapping[str, RemoteSlave]) -> None:
         """From now on tell these slaves' links when their token goes away."""
         with self._changed:
             self._remotes = remotes
-            lost = [remote.key for remote in remotes.values() if remote.key not in self._alive]
-        for slave in lost:
-            self._lost(slave)
+            lost = [remote for remote in remotes.values() if remote.key not in self._alive]
+        for remote in lost:
+            self._lost(remote)
 
-    def _lost(self, slave: SlaveKey) -> None:
-        self._remotes[slave.alive].lost()
-        timer = threading.Timer(_RETURN_TIME, self._abandon, (slave,))
+    def _lost(self, remote: RemoteSlave) -> None:
+        remote.lost()
+        timer = threading.Timer(_RETURN_TIME, self._abandon, (remote.key,))
         timer.daemon = True
         timer.start()
 
