@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
-from protocol.errors import DoublestepError, InterruptedRunError
+from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
 
 app = typer.Typer(
     help="Co-simulation master with error-controlled communication step sizes.",
@@ -66,51 +67,51 @@ def run(  # noqa: PLR0917  options of the command line
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
 ) -> None:
     """Run SYSTEM.toml and write results.csv, steps.csv, summary.json and results.png."""
-    from rich.console import Console  # noqa: PLC0415  each command imports what it needs
+    with _interruptible():
+        from rich.console import Console  # noqa: PLC0415  each command imports what it needs
 
-    from master_node.configuration import load_system  # noqa: PLC0415
-    from master_node.plots import plot_result  # noqa: PLC0415
-    from master_node.progress import ProgressBar, summary_table  # noqa: PLC0415
-    from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
-    from master_node.simulation import run as run_system  # noqa: PLC0415
+        from master_node.configuration import load_system  # noqa: PLC0415
+        from master_node.plots import plot_result  # noqa: PLC0415
+        from master_node.progress import ProgressBar, summary_table  # noqa: PLC0415
+        from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
+        from master_node.simulation import run as run_system  # noqa: PLC0415
 
-    signal.signal(signal.SIGTERM, _interrupt)
-    system = (
-        load_system(system_file)
-        .with_simulation(
-            order=order,
-            estimator=estimator,
-            relative_tolerance=relative_tolerance,
-            absolute_tolerance=absolute_tolerance,
-            start_time=start_time,
-            stop_time=stop_time,
-            initial_step_size=step_size,
+        system = (
+            load_system(system_file)
+            .with_simulation(
+                order=order,
+                estimator=estimator,
+                relative_tolerance=relative_tolerance,
+                absolute_tolerance=absolute_tolerance,
+                start_time=start_time,
+                stop_time=stop_time,
+                initial_step_size=step_size,
+            )
+            .with_bus(
+                connect=tuple(connect or ()),
+                listen=tuple(listen or ()),
+                insecure=insecure,
+                discovery_timeout=timeout,
+                pin=pin,
+            )
         )
-        .with_bus(
-            connect=tuple(connect or ()),
-            listen=tuple(listen or ()),
-            insecure=insecure,
-            discovery_timeout=timeout,
-            pin=pin,
-        )
-    )
-    try:
-        run_system(
-            system,
-            output,
-            in_process=in_process,
-            launch=not no_launch,
-            observers=(ProgressBar(quiet=quiet),),
-        )
-    except KeyboardInterrupt:
-        raise InterruptedRunError("interrupted before the first step") from None
-    result = Result.load(output)
-    if not no_plot:
-        plot_result(result, output / PLOT_FILE, show=False, variables=None)
-    if not quiet:
-        console = Console()
-        console.print(summary_table(result.summary))
-        console.print(f"results in {output}", highlight=False)
+        try:
+            run_system(
+                system,
+                output,
+                in_process=in_process,
+                launch=not no_launch,
+                observers=(ProgressBar(quiet=quiet),),
+            )
+        except KeyboardInterrupt:
+            raise InterruptedRunError("interrupted before the first step") from None
+        result = Result.load(output)
+        if not no_plot:
+            plot_result(result, output / PLOT_FILE, show=False, variables=None)
+        if not quiet:
+            console = Console()
+            console.print(summary_table(result.summary))
+            console.print(f"results in {output}", highlight=False)
 
 
 @app.command()
@@ -129,7 +130,10 @@ def plot(
     from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
 
     path = file or directory / PLOT_FILE
-    plot_result(Result.load(directory), path, show=show, variables=variable or None)
+    try:
+        plot_result(Result.load(directory), path, show=show, variables=variable or None)
+    except KeyError as error:
+        raise ConfigurationError(f"{directory}: {error.args[0]}", phase="plot") from None
     typer.echo(path)
 
 
@@ -151,9 +155,15 @@ def compare(
         raise typer.Exit(1)
 
 
-def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
-    """SIGTERM ends a run as Ctrl-C does."""
-    raise KeyboardInterrupt
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the command with exit code 130, also where a shell ignores them."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise InterruptedRunError("interrupted") from None
 
 
 def main() -> None:

@@ -210,7 +210,7 @@ class BusSettings(_Table):
     Attributes:
         listen: where slaves that are not started by this master can connect to; default: the
             loopback port 7447 when there are such slaves and nothing to connect to.
-        connect: routers or slaves to connect to.
+        connect: slaves that listen.
         insecure: allow addresses other than loopback.
         discovery_timeout: how long to wait for slaves to appear [s].
         step_timeout: how long one request may take [s].

@@ -56,9 +56,11 @@ def serve(  # noqa: PLR0917  options of the command line
         list[str] | None, typer.Option(help="Start value, name=value; may be repeated.")
     ] = None,
     insecure: Annotated[
-        bool, typer.Option(help="Allow addresses other than loopback: no encryption.")
+        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
     ] = False,
-    fmi_logging: Annotated[bool, typer.Option(help="Let the FMU log all categories.")] = False,
+    fmi_logging: Annotated[
+        bool, typer.Option("--fmi-logging", help="Let the FMU log all categories.")
+    ] = False,
     base: Annotated[
         Path, typer.Option(help="Directory to which the model's path is relative.")
     ] = Path(),

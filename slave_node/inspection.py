@@ -49,7 +49,7 @@ def _variables(description: SlaveDescription) -> Table:
         table.add_column(column, no_wrap=True)
     table.add_column("start", no_wrap=True, justify="right")
     table.add_column("nominal", no_wrap=True, justify="right")
-    table.add_column("description", no_wrap=True, overflow="ellipsis", max_width=60)
+    table.add_column("description", min_width=12)
     for v in description.variables:
         table.add_row(
             v.name,
