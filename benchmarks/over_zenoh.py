@@ -1,6 +1,5 @@
 """An attempted double step over Zenoh against an empty fan-out to two processes."""
 
-import socket
 import subprocess
 import sys
 import tempfile
@@ -14,14 +13,12 @@ from master_node.co_simulation import CoSimulation
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import slaves_on_bus
 from master_node.system import resolve
-from protocol.zenoh_bus import Endpoints, ZenohBus
+from protocol.zenoh_bus import Endpoints, ZenohBus, free_endpoint
 
 
 def run() -> list[tuple[str, str, str, str]]:
     """Rows: configuration, median attempt, median empty fan-out, ratio."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     bus = ZenohBus(Endpoints(listen=(endpoint,)))
     alive = threading.Semaphore(0)
     bus.watch("echo/*/alive", lambda _, up: alive.release() if up else None)

@@ -30,8 +30,6 @@ from protocol.errors import ConfigurationError
 from protocol.keys import check_name
 from protocol.names import nearest
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-
 
 def _finite(value: float) -> float:
     if not math.isfinite(value):

@@ -7,7 +7,6 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from secrets import token_hex
@@ -138,11 +137,6 @@ class Launcher:
                 process.kill()
                 process.wait(_KILL_TIME)
         self._scratch.cleanup()
-
-    @property
-    def process_ids(self) -> Mapping[str, int]:
-        """Of the slaves, by name."""
-        return {name: process.pid for name, process in self._processes.items()}
 
     def _log(self, name: str) -> Path:
         return self._log_directory / f"{name}.log"

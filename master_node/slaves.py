@@ -5,7 +5,6 @@ Each way is a context manager that gives a `Slaves` and leaves nothing running b
 
 from __future__ import annotations
 
-import socket
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping
@@ -16,11 +15,11 @@ from pathlib import Path
 from secrets import token_hex
 from time import monotonic
 
-from master_node.configuration import DEFAULT_ENDPOINT, System
+from master_node.configuration import System
 from master_node.launcher import Launcher
 from master_node.remote_slave import RemoteSlave, slave_status
 from master_node.slave_link import LocalSlave, SlaveLink
-from protocol.bus import Bus
+from protocol.bus import DEFAULT_ENDPOINT, Bus
 from protocol.calls import Describe
 from protocol.errors import (
     ConfigurationError,
@@ -32,7 +31,7 @@ from protocol.errors import (
 )
 from protocol.keys import SlaveKey, alive_master, alive_slaves
 from protocol.slave import SlaveDescription
-from protocol.zenoh_bus import Endpoints, ZenohBus
+from protocol.zenoh_bus import Endpoints, ZenohBus, free_endpoint
 
 _POLL_TIME = 0.02
 _RETURN_TIME = 0.5
@@ -109,7 +108,7 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
     """
     launched = {n for n, s in system.slaves.items() if launch and s.model is not None}
     found = [name for name in system.slaves if name not in launched]
-    private = f"tcp/127.0.0.1:{_free_port()}"
+    private = free_endpoint()
     with ExitStack() as stack:
         bus = ZenohBus(_endpoints(system, private, launched=bool(launched), found=bool(found)))
         stack.callback(bus.close)
@@ -172,13 +171,6 @@ def _endpoints(system: System, private: str, *, launched: bool, found: bool) -> 
         raise ConfigurationError(
             f"{system.source}: [bus] {error.cause}", remedy=error.remedy
         ) from None
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class _Presence:

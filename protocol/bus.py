@@ -13,6 +13,9 @@ from collections.abc import Callable
 
 from protocol.errors import SlaveLostError
 
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+"""Where a master and slaves that were started by hand meet when nobody says otherwise."""
+
 Handler = Callable[[bytes], bytes]
 """Serves one request. Called by one thread at a time; must not raise."""
 

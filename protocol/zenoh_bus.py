@@ -10,6 +10,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import os
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -74,6 +75,13 @@ def host_of(endpoint: str) -> str:
             f"{endpoint!r} is not an endpoint", remedy="write tcp/HOST:PORT, as tcp/127.0.0.1:7447"
         )
     return host.strip("[]")
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint on whose port nobody listens now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def _is_loopback(host: str) -> bool:

@@ -19,11 +19,10 @@ from typing import Annotated, Any
 
 import typer
 
+from protocol.bus import DEFAULT_ENDPOINT
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.keys import SlaveKey, check_name
 from protocol.slave import StartValue
-
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 app = typer.Typer(
     help="Serve an FMU or a Python model as a co-simulation slave.",

@@ -17,12 +17,12 @@ import tempfile
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Protocol
 
-from protocol.calls import Call, Describe, Initialize, Reply
+from protocol.calls import Call, Describe, Initialize
 from protocol.codec import decode_program, decode_reply, encode_error, encode_program, encode_reply
 from protocol.errors import (
     DeadlineError,
@@ -77,24 +77,18 @@ class Worker(Protocol):
 def execute_program(executor: CallExecutor, reference: ModelReference, program: bytes) -> bytes:
     """Decode, execute, encode: never raises."""
     try:
-        calls = [_with_parameters(call, reference) for call in decode_program(program)]
-        reply = executor.execute(calls)
+        calls = decode_program(program)
     except DoublestepError as error:
-        reply = Reply([], error, 0.0)
-    return encode_reply(reply)
+        return encode_error(error)
+    if reference.parameters:
+        calls = [_with_parameters(call, reference.parameters) for call in calls]
+    return encode_reply(executor.execute(calls))
 
 
-def _with_parameters(call: Call, reference: ModelReference) -> Call:
-    if type(call) is Initialize and reference.parameters:
-        values = {**reference.parameters, **call.start_values}
-        return Initialize(
-            call.start_time,
-            call.stop_time,
-            call.relative_tolerance,
-            values,
-            call.inputs,
-            call.outputs,
-        )
+def _with_parameters(call: Call, parameters: Mapping[str, StartValue]) -> Call:
+    """Start values from the command line stand behind those of the master."""
+    if type(call) is Initialize:
+        return replace(call, start_values={**parameters, **call.start_values})
     return call
 
 
@@ -233,7 +227,7 @@ def _main(pipe: Connection, reference: ModelReference, scratch: str) -> None:
             )
         )
     except DoublestepError as error:
-        pipe.send_bytes(encode_reply(Reply([], error, 0.0)))
+        pipe.send_bytes(encode_error(error))
         return
     try:
         pipe.send_bytes(execute_program(executor, reference, encode_program([Describe()])))

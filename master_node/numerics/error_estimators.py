@@ -52,7 +52,7 @@ class ErrorEstimator:
     ratios: tuple[float, ...]
 
     def ratio(self, orders: NDArray[np.intp]) -> FloatArray:
-        """P for each output.
+        """The ratio p for each output, shape (m,).
 
         Args:
             orders: degree of the input polynomials of the slave that an output belongs to,
