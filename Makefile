@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test check fmus benchmark format clean
+.PHONY: demo test check fmus benchmark reproduce format clean
 
 demo: fmus ## the paper's quarter car: two FMU processes, one master, over Zenoh
 	$(BIN)/master-node run examples/quarter_car/displacement.toml --output demo_results
@@ -20,9 +20,13 @@ check: $(STAMP) ## linter, formatter, type checker, import layers
 
 fmus: $(STAMP) ## compile the example FMUs
 	$(BIN)/python examples/quarter_car/build.py
+	$(BIN)/python examples/oscillators/build.py
 
 benchmark: fmus ## the tables of docs/benchmarks.md
 	$(BIN)/python -m benchmarks
+
+reproduce: fmus ## the pages and pictures of docs/reproduction
+	$(BIN)/python -m benchmarks.reproduction
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
@@ -34,4 +38,4 @@ $(STAMP): pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo_results results examples/quarter_car/*.fmu
+	rm -rf $(VENV) demo_results results examples/*/*.fmu

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import socket
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from secrets import token_hex
@@ -14,7 +15,7 @@ import psutil
 import pytest
 from hypothesis import settings
 
-BUILD_SCRIPT = Path(__file__).parents[1] / "examples" / "quarter_car" / "build.py"
+EXAMPLES = Path(__file__).parents[1] / "examples"
 
 # A slow moment of the machine is no counterexample.
 settings.register_profile("doublestep", deadline=None)
@@ -24,23 +25,44 @@ _MARK = "DOUBLESTEP_TEST_SESSION"
 _TIME_TO_END = 3.0
 
 
-@pytest.fixture(scope="session")
-def build_script() -> ModuleType:
-    """The script that builds the example FMUs, from where it lies: examples are not a package."""
-    spec = importlib.util.spec_from_file_location("quarter_car_build", BUILD_SCRIPT)
+def _example(folder: str, script: str) -> ModuleType:
+    """A script of the examples, from where it lies: examples are not a package."""
+    name = f"{folder}_{script}"
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / folder / f"{script}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look there
     spec.loader.exec_module(module)
     return module
 
 
 @pytest.fixture(scope="session")
+def build_script() -> ModuleType:
+    """The script that builds the FMUs of the quarter car."""
+    return _example("quarter_car", "build")
+
+
+@pytest.fixture(scope="session")
 def fmu_dir(build_script: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with the four FMUs."""
+    """The folder with the four FMUs of the quarter car."""
     folder = tmp_path_factory.mktemp("quarter_car")
     build_script.build(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def oscillator_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the three FMUs of the oscillators."""
+    folder = tmp_path_factory.mktemp("oscillators")
+    _example("oscillators", "build").build(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def oscillators() -> ModuleType:
+    """The reference solutions of the oscillators."""
+    return _example("oscillators", "oscillators")
 
 
 @pytest.fixture

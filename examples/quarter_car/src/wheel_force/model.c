@@ -23,15 +23,18 @@ static void derivatives(const double p[], const double s[], const double u[], do
     ds[v] = (p[k_w] * (p[z] - s[x]) - p[d_w] * s[v] - force(p, s, u)) / p[m];
 }
 
-static void output_values(const double p[], const double s[], const double u[], double y[])
+static void output_values(double t, const double p[], const double s[], const double u[],
+                          double y[])
 {
+    (void)t;
     y[F] = force(p, s, u);
 }
 
 /* F is linear in states and inputs, so F' is the same form in their derivatives. */
-static void output_derivatives(const double p[], const double s[], const double ds[],
+static void output_derivatives(double t, const double p[], const double s[], const double ds[],
                                const double u[], const double du[], double dy[])
 {
+    (void)t;
     (void)s;
     (void)u;
     dy[F] = force(p, ds, du);

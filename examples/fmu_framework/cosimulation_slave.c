@@ -344,7 +344,7 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nv
             value[i] = dx[derivative];
         } else if (output >= 0) {
             double y[MAX_OUTPUTS];
-            model.output_values(state->p, state->x, state->u[0], y);
+            model.output_values(state->time, state->p, state->x, state->u[0], y);
             value[i] = y[output];
         } else {
             return report(slave, fmi2Error, __func__, "no Real variable has value reference %u",
@@ -415,10 +415,11 @@ fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReferenc
         return report(slave, fmi2Error, __func__, "order is NULL");
 
     const SlaveState *state = &slave->state;
-    double dx[MAX_STATES], dy[MAX_OUTPUTS];
-    right_hand_side(state, 0.0, state->x, dx);
+    double dx[MAX_STATES] = {0.0}, dy[MAX_OUTPUTS];
+    if (model.states)
+        right_hand_side(state, 0.0, state->x, dx);
     if (model.outputs)
-        model.output_derivatives(state->p, state->x, dx, state->u[0], state->u[1], dy);
+        model.output_derivatives(state->time, state->p, state->x, dx, state->u[0], state->u[1], dy);
 
     for (size_t i = 0; i < nvr; ++i) {
         const int output = index_in(vr[i], OUTPUT, model.outputs);

@@ -13,7 +13,7 @@
 enum { MAX_STATES = 4 };
 
 typedef struct {
-    int n; /* number of states, at most MAX_STATES */
+    int n; /* number of states, at most MAX_STATES; with 0 the end is reached at once */
     void (*right_hand_side)(const void *context, double tau, const double x[], double dx[]);
     const void *context;
     double tolerance;      /* relative; times `nominal` it is also the absolute tolerance */

@@ -1,10 +1,11 @@
 /* What a model must provide to become a co-simulation slave:
  *
- *     x' = f(p, x, u)        its states, two or so
- *     y  = g(p, x, u)        outputs that are not states
+ *     x' = f(p, x, u)        its states, two or so, or none
+ *     y  = g(t, p, x, u)     outputs that are not states
  *     y' = dg/dt             with the derivatives of x and u
  *
- * and the value references by which modelDescription.xml calls all of them.
+ * and the value references by which modelDescription.xml calls all of them. The time t [s] is that
+ * of the communication point at which the slave stands.
  */
 #ifndef MODEL_H
 #define MODEL_H
@@ -13,7 +14,7 @@
 
 #include <stdbool.h>
 
-enum { MAX_INPUTS = 2, MAX_OUTPUTS = 1, MAX_PARAMETERS = 6 };
+enum { MAX_INPUTS = 4, MAX_OUTPUTS = 1, MAX_PARAMETERS = 6 };
 
 /* Value reference = block + index within the block. */
 enum {
@@ -36,10 +37,12 @@ typedef struct {
     double nominal[MAX_STATES]; /* of the states, for the absolute tolerance */
     double parameter_start[MAX_PARAMETERS];
 
+    /* NULL where `states` is 0. */
     void (*derivatives)(const double p[], const double x[], const double u[], double dx[]);
     /* Both NULL where `outputs` is 0. `du` is u'. */
-    void (*output_values)(const double p[], const double x[], const double u[], double y[]);
-    void (*output_derivatives)(const double p[], const double x[], const double dx[],
+    void (*output_values)(double t, const double p[], const double x[], const double u[],
+                          double y[]);
+    void (*output_derivatives)(double t, const double p[], const double x[], const double dx[],
                                const double u[], const double du[], double dy[]);
 } Model;
 

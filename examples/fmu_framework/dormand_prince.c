@@ -115,6 +115,8 @@ static double step_factor(double error)
 IntegrationResult dormand_prince(const InitialValueProblem *problem, double end, double x[],
                                  double *step)
 {
+    if (problem->n == 0)
+        return REACHED_END;
     const size_t size = (size_t)problem->n * sizeof(double);
     double now[MAX_STATES], next[MAX_STATES], k[STAGES][MAX_STATES];
     memcpy(now, x, size);

@@ -10,7 +10,7 @@
 #include <string.h>
 
 enum { STATE_VERSION = 1 };
-static const uint32_t STATE_MAGIC = 0x51434152u; /* "QCAR" */
+static const uint32_t STATE_MAGIC = 0x534c4156u; /* "SLAV" */
 
 typedef struct {
     uint32_t magic, version;
@@ -19,8 +19,15 @@ typedef struct {
     SlaveState state;
 } SavedState;
 
+enum {
+    HEADER_BYTES = 4 + 4 + 8 + 32,
+    STATE_DOUBLES = 5 + MAX_STATES + (MAX_INPUT_ORDER + 1) * MAX_INPUTS + MAX_PARAMETERS
+};
+
 /* Does not compile if the compiler had to pad: padding would serialise as random bytes. */
-typedef char no_padding[sizeof(SavedState) == 48 + 184 + 8 ? 1 : -1];
+typedef char no_padding[sizeof(SavedState) == HEADER_BYTES + STATE_DOUBLES * sizeof(double) + 2 * 4
+                            ? 1
+                            : -1];
 
 /* Only whole states may be saved: what a failed step leaves behind is not one. */
 enum {
