@@ -29,8 +29,15 @@ ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
 def run(  # noqa: PLR0917  options of the command line
     system_file: Annotated[Path, typer.Argument(metavar="SYSTEM.toml", help="What to run.")],
     output: Annotated[Path, typer.Option(help="Directory for the results.")] = Path("results"),
+    preset: Annotated[
+        str | None, typer.Option(help="paper: the method as Schierz, Arnold and Clauß have it.")
+    ] = None,
     order: Annotated[
-        int | None, typer.Option(min=0, max=3, help="Degree k of the input polynomials.")
+        str | None, typer.Option(help="Degree k of the input polynomials, 0 to 3, or auto.")
+    ] = None,
+    derivative_points: Annotated[
+        int | None,
+        typer.Option(min=0, max=2, help="Points at which input polynomials meet derivatives."),
     ] = None,
     estimator: Annotated[
         str | None, typer.Option(help="rich, mod, or none for a fixed step.")
@@ -39,6 +46,15 @@ def run(  # noqa: PLR0917  options of the command line
     absolute_tolerance: Annotated[float | None, typer.Option(help="ATOL of all outputs.")] = None,
     start_time: Annotated[float | None, typer.Option(help="[s]")] = None,
     stop_time: Annotated[float | None, typer.Option(help="[s]")] = None,
+    controller: Annotated[
+        str | None, typer.Option(help="Of the step size: pi or elementary.")
+    ] = None,
+    sequence: Annotated[
+        str | None, typer.Option(help="jacobi: all slaves at once; gauss-seidel: one by one.")
+    ] = None,
+    output_interval: Annotated[
+        float | None, typer.Option(help="Write results at multiples of this [s].")
+    ] = None,
     step_size: Annotated[
         float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
     ] = None,
@@ -79,7 +95,12 @@ def run(  # noqa: PLR0917  options of the command line
         system = (
             load_system(system_file)
             .with_simulation(
-                order=order,
+                preset=preset,
+                order=_order(order),
+                derivative_points=derivative_points,
+                controller=controller,
+                sequence=sequence,
+                output_interval=output_interval,
                 estimator=estimator,
                 relative_tolerance=relative_tolerance,
                 absolute_tolerance=absolute_tolerance,
@@ -153,6 +174,11 @@ def compare(
     Console().print(comparison.table())
     if not comparison.within_tolerance:
         raise typer.Exit(1)
+
+
+def _order(text: str | None) -> int | str | None:
+    """A number where it is one; whether it may be is for the system to say."""
+    return int(text) if text is not None and text.isdecimal() else text
 
 
 @contextmanager

@@ -26,9 +26,12 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
+from master_node.numerics.dense_output import OutputGrid
+from master_node.numerics.extrapolation import InputPolynomial
 from protocol.errors import ConfigurationError
 from protocol.keys import check_name
 from protocol.names import nearest
+from protocol.signals import MAX_ORDER
 
 
 def _finite(value: float) -> float:
@@ -55,15 +58,40 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+_PAPER: Mapping[str, Any] = {
+    "order": 1,
+    "derivative_points": 0,
+    "constants": "paper",
+    "controller": "elementary",
+    "discontinuities": False,
+    "initial_history": "rest",
+}
+"""What ``preset = "paper"`` stands for; keys that are given beside it win."""
+
+
 class SimulationSettings(_Table):
     """The ``[simulation]`` table.
 
     Attributes:
+        preset: ``paper``: the method as Schierz, Arnold and Clauß have it: values only, the
+            constants of an equidistant history, the elementary controller.
         start_time, stop_time: [s].
-        initial_step_size: H_0 [s]; default: a thousandth of the simulated time, within the bounds
-            of H. With estimator ``none`` it is the step size of the whole run.
-        order: degree k of the input polynomials.
+        initial_step_size: H_0 [s]; default: chosen by the system. With estimator ``none`` it is
+            the step size of the whole run, by default a thousandth of the simulated time.
+        order: degree k of the input polynomials, or ``auto``: chosen for each step.
+        derivative_points: at how many of the newest points an input polynomial meets the
+            derivatives of the outputs too, where slaves have them; default: 0 with a given
+            ``order``, up to 2 with ``auto``.
         estimator: EST_Rich, EST_mod or none (a fixed step).
+        constants: of the estimators: ``exact`` for the nodes there are, or the ``paper``'s.
+        controller: of the step size: ``pi`` or ``elementary``.
+        sequence: ``jacobi``: all slaves take a step at once, with extrapolated inputs;
+            ``gauss-seidel``: one after the other, with what the earlier ones have found.
+        evaluate_outputs: evaluate outputs with direct feed-through again at each communication
+            point, with the inputs that are known there by then.
+        discontinuities: find jumps of the coupled variables, step up to them, and cut the history.
+        events: times at which something jumps [s]; a communication point is put there and the
+            history cut.
         relative_tolerance, absolute_tolerance: RTOL and ATOL of equation (8) for all outputs;
             ATOL counts in units of a variable's nominal value.
         slave_tolerance: relative tolerance for the slaves' own solvers; default 0.01 RTOL.
@@ -71,14 +99,25 @@ class SimulationSettings(_Table):
         smallest_step_size, largest_step_size: bounds of H [s]; defaults: 1e-9 of the simulated
             time, and half of it.
         initial_history: ``rest``: the system rested before the start, so order k is used from
-            the first step; ``none``: the order grows as communication points come in.
+            the first step; ``none``: the order grows as communication points come in. Default:
+            ``none`` where the order is chosen, else ``rest``.
+        output_interval: write results at start_time + i output_interval [s], by dense output,
+            instead of at the communication points.
     """
 
+    preset: Literal["paper"] | None = None
     start_time: Number = 0.0
     stop_time: Number | None = None
     initial_step_size: Positive | None = None
-    order: Literal[0, 1, 2, 3] = 1
+    order: Literal[0, 1, 2, 3, "auto"] = "auto"
+    derivative_points: Literal[0, 1, 2] | None = None
     estimator: Literal["rich", "mod", "none"] = "mod"
+    constants: Literal["exact", "paper"] = "exact"
+    controller: Literal["pi", "elementary"] = "pi"
+    sequence: Literal["jacobi", "gauss-seidel"] = "jacobi"
+    evaluate_outputs: StrictBool = False
+    discontinuities: StrictBool = True
+    events: tuple[Number, ...] = ()
     relative_tolerance: NotNegative = 1e-4
     absolute_tolerance: Positive = 1e-4
     slave_tolerance: Positive | None = None
@@ -87,14 +126,40 @@ class SimulationSettings(_Table):
     theta_max: Annotated[Number, Field(gt=1)] = 2.0
     smallest_step_size: Positive | None = None
     largest_step_size: Positive | None = None
-    initial_history: Literal["rest", "none"] = "rest"
+    initial_history: Literal["rest", "none"] | None = None
+    output_interval: Positive | None = None
 
-    @field_validator("order", mode="before")
+    @model_validator(mode="before")
     @classmethod
-    def _whole_order(cls, value: Any) -> Any:
-        if isinstance(value, bool):
-            raise ValueError("must be 0, 1, 2 or 3")  # noqa: TRY004  pydantic wants ValueError
+    def _preset(cls, value: Any) -> Any:
+        if isinstance(value, Mapping) and value.get("preset") == "paper":
+            return {**_PAPER, **value}
         return value
+
+    @field_validator("order", "derivative_points", mode="before")
+    @classmethod
+    def _whole_number(cls, value: Any) -> Any:
+        if isinstance(value, bool):
+            raise ValueError("must be a whole number")  # noqa: TRY004  pydantic wants ValueError
+        return value
+
+    @model_validator(mode="after")
+    def _polynomials(self) -> Self:
+        if self.derivative_points:
+            if self.constants == "paper":
+                raise ValueError(
+                    'constants = "paper" hold for values only: they need derivative_points = 0'
+                )
+            if self.order != "auto" and self.derivative_points > (self.order + 1) // 2:
+                raise ValueError(
+                    f"a polynomial of order {self.order} cannot meet derivatives at "
+                    f"{self.derivative_points} points"
+                )
+        if self.events and self.estimator == "none":
+            raise ValueError("events need an estimator: without one all steps have one size")
+        if self.constants == "paper" and self.sequence == "gauss-seidel":
+            raise ValueError('constants = "paper" hold for sequence = "jacobi" only')
+        return self
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -105,19 +170,22 @@ class SimulationSettings(_Table):
             raise ValueError(
                 f"stop_time {self.stop_time:g} must be after start_time {self.start_time:g}"
             )
-        smallest, initial, largest = self.smallest, self.step_size, self.largest_step_size
+        smallest, initial, largest = self.smallest, self.initial_step_size, self.largest_step_size
         if largest is not None and smallest > largest:
             raise ValueError(
                 f"smallest_step_size {smallest:g} is above largest_step_size {largest:g}"
             )
-        if initial < smallest:
+        if initial is not None and initial < smallest:
             raise ValueError(
                 f"initial_step_size {initial:g} is below smallest_step_size {smallest:g}"
             )
-        if largest is not None and initial > largest:
+        if initial is not None and largest is not None and initial > largest:
             raise ValueError(
                 f"initial_step_size {initial:g} is above largest_step_size {largest:g}"
             )
+        for event in self.events:
+            if not self.start_time < event < self.stop_time:
+                raise ValueError(f"the event at {event:g} is not between start and stop time")
         return self
 
     @property
@@ -135,11 +203,18 @@ class SimulationSettings(_Table):
 
     @property
     def step_size(self) -> float:
-        """H_0 [s]."""
+        """H_0 [s] as given; else a thousandth of the simulated time, within the bounds of H."""
         if self.initial_step_size is not None:
             return float(self.initial_step_size)
         default = max((self.end - self.start_time) * 1e-3, self.smallest_step_size or 0.0)
         return float(min(default, self.largest_step_size or default))
+
+    @property
+    def given_step_size(self) -> float | None:
+        """H_0 [s], or that of all steps without an estimator; None: chosen at the start."""
+        if self.initial_step_size is None and self.estimator != "none":
+            return None
+        return self.step_size
 
     @property
     def smallest(self) -> float:
@@ -152,6 +227,33 @@ class SimulationSettings(_Table):
     def largest(self) -> float:
         """Largest communication step size [s]."""
         return float(self.largest_step_size or (self.end - self.start_time) / 2)
+
+    @property
+    def polynomial(self) -> InputPolynomial:
+        """The input polynomials to use, with ``auto`` the highest that may be chosen.
+
+        Without an estimator there is nothing to choose by, so ``auto`` is order 1 then.
+        """
+        if self.order != "auto":
+            return InputPolynomial(self.order, self.derivative_points or 0)
+        if self.estimator == "none":
+            return InputPolynomial(1, min(self.derivative_points or 0, 1))
+        wanted = 2 if self.derivative_points is None else self.derivative_points
+        return InputPolynomial(MAX_ORDER, 0 if self.constants == "paper" else wanted)
+
+    @property
+    def rests_before_start(self) -> bool:
+        """Whether the past of the system is that of one at rest."""
+        if self.initial_history is not None:
+            return self.initial_history == "rest"
+        return self.order != "auto" or self.estimator == "none"
+
+    @property
+    def output_grid(self) -> OutputGrid | None:
+        """Where results are wanted; None: at the communication points."""
+        if self.output_interval is None:
+            return None
+        return OutputGrid(float(self.start_time), float(self.output_interval), self.end)
 
     @property
     def slave_relative_tolerance(self) -> float | None:
@@ -177,6 +279,11 @@ class SlaveSettings(_Table):
         parameters: start values of parameters and other variables, by name.
         relative_tolerance, absolute_tolerance: for this slave's outputs.
         tolerances: for single outputs, by name.
+        step_size: the only communication step size that it takes [s].
+        step_multiple: each of its communication steps must be a multiple of this [s].
+        smallest_step_size, largest_step_size: bounds of its communication steps [s].
+        outputs_follow_inputs: whether its outputs can be read again after inputs were set, without
+            a step in between (FMI 2.0 does not promise it); default: what is known of its kind.
     """
 
     model: StrictStr | None = None
@@ -184,6 +291,11 @@ class SlaveSettings(_Table):
     relative_tolerance: NotNegative | None = None
     absolute_tolerance: Positive | None = None
     tolerances: Mapping[str, OutputTolerance] = Field(default_factory=dict)
+    step_size: Positive | None = None
+    step_multiple: Positive | None = None
+    smallest_step_size: Positive | None = None
+    largest_step_size: Positive | None = None
+    outputs_follow_inputs: StrictBool | None = None
 
 
 class Connection(_Table):
@@ -270,9 +382,16 @@ class System(_Table):
         return self
 
     def with_simulation(self, **settings: Any) -> System:
-        """The same system with other simulation settings; None leaves one as it is."""
+        """The same system with other simulation settings; None leaves one as it is.
+
+        A preset here wins over single settings of the system, except for a fixed ``order``.
+        """
         given = {name: value for name, value in settings.items() if value is not None}
-        simulation = self.simulation.model_dump(exclude_unset=True) | given
+        simulation = self.simulation.model_dump(exclude_unset=True)
+        if given.get("preset") == "paper":
+            order = self.simulation.order
+            simulation |= {**_PAPER, "order": _PAPER["order"] if order == "auto" else order}
+        simulation |= given
         return self._with(simulation=simulation)
 
     def with_bus(self, **settings: Any) -> System:

@@ -1,85 +1,161 @@
-"""From an attempted double step to a verdict: ERR, accepted or not, and the next step size."""
+"""From an attempted double step to its error: EST for each output, ERR over all."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from master_node.configuration import SimulationSettings
-from master_node.double_step import DoubleStep, FailedStep
-from master_node.numerics.error_estimators import ErrorEstimator
+from master_node.coupling_scheme import CouplingScheme
+from master_node.double_step import DoubleStep
+from master_node.numerics.error_estimators import Comparison, ErrorEstimator, exact_ratio
+from master_node.numerics.extrapolation import Nodes, Polynomials
 from master_node.numerics.norms import first_not_finite, weighted_rms_norm
-from master_node.numerics.step_size_controller import StepSizeController
 from master_node.system import CoupledSystem
+from protocol.signals import FloatArray
 
 _INF = float("inf")
 
 
-class Verdict(NamedTuple):
-    """What is made of an attempt.
+class StepNodes(NamedTuple):
+    """Nodes of the input polynomials in a double step, for each kind, as offsets from T_n [s].
 
     Attributes:
-        accepted: whether to go on from its end.
-        step_size: H for the next attempt [s].
-        error_norm: ERR; inf when there is none.
-        limiting_variable: ``slave.variable`` with the largest part in ERR, or why there is none.
+        first: of the first small step.
+        second: of the second one.
+        comparison: of the comparison solution.
     """
 
-    accepted: bool
-    step_size: float
-    error_norm: float
+    first: list[Nodes]
+    second: list[Nodes]
+    comparison: list[Nodes]
+
+
+class StepError(NamedTuple):
+    """The estimated error of a double step.
+
+    Attributes:
+        estimate: EST, shape (m,), unit [y].
+        norm: ERR of equation (8); inf when a value is not finite.
+        limiting_variable: ``slave.variable`` with the largest part in ERR.
+    """
+
+    estimate: FloatArray
+    norm: float
     limiting_variable: str
 
 
 class ErrorControl:
-    """Equation (8) and the step size controller for one coupled system.
+    """Equation (8) for one coupled system, with the estimates' constants.
 
     Args:
         coupled: the system, with its tolerances.
-        settings: of the controller.
+        scheme: how its slaves are coupled.
         estimator: EST_Rich or EST_mod.
-        orders: for each slave the highest degree of input polynomial that it takes.
+        constants: ``exact`` or ``paper``, see ``numerics/error_estimators.py``.
     """
 
     def __init__(
         self,
         coupled: CoupledSystem,
-        settings: SimulationSettings,
+        scheme: CouplingScheme,
         estimator: ErrorEstimator,
-        orders: Sequence[int],
+        constants: str,
     ) -> None:
         self._names = coupled.output_names
         self._absolute_tolerance = coupled.absolute_tolerance
         self._relative_tolerance = coupled.relative_tolerance
         self._estimate = estimator.estimate
-        self._ratios = [
-            estimator.ratio(np.minimum(np.array(orders), k)[coupled.output_slave])
-            for k in range(settings.order + 1)
-        ]
-        smoothing = 1 if coupled.has_feed_through else 2
-        self._exponents = [min(*orders, k) + smoothing for k in range(settings.order + 1)]
-        self._controller = StepSizeController(
-            settings.alpha,
-            settings.theta_min,
-            settings.theta_max,
-            settings.smallest,
-            settings.largest,
-        )
+        self._extrapolation = scheme.extrapolation
+        self._known_ahead = scheme.known_ahead
+        self._is_long_step = estimator.comparison is Comparison.LONG_STEP
+        self._paper_ratios = estimator.paper_ratios if constants == "paper" else None
+        self._has_feed_through = bool(scheme.feed_through.any())
+        self._ahead = [kind.ahead for kind in scheme.extrapolation.kinds]
+        combinations: list[tuple[frozenset[int], bool]] = []
+        index = []
+        for kinds, direct in zip(scheme.output_kinds, scheme.feed_through.tolist(), strict=True):
+            if (kinds, direct) not in combinations:
+                combinations.append((kinds, direct))
+            index.append(combinations.index((kinds, direct)))
+        self._combinations = combinations
+        self._combination_of_output = np.array(index, dtype=np.intp)
+        used = frozenset[int]().union(*scheme.output_kinds)
+        self._used_kinds = sorted(used)
 
-    def judge(self, attempt: DoubleStep | FailedStep, step_size: float, order: int) -> Verdict:
-        """The verdict on an attempt with ``step_size`` H [s] and input polynomials of ``order``."""
-        if isinstance(attempt, FailedStep):
-            following = self._controller.after_discard(step_size, attempt.reached)
-            return Verdict(False, following, _INF, attempt.reason)
-        y = attempt.y
-        error = self._estimate(y, attempt.y_comparison, self._ratios[order])
+    def exponent(self, polynomials: Polynomials) -> int:
+        """P: k + 1 if an output depends directly on extrapolated inputs, else k + 2."""
+        order = min([polynomials[i].order for i in self._used_kinds], default=0)
+        return order + (1 if self._has_feed_through else 2)
+
+    def judge(self, step: DoubleStep) -> StepError:
+        """EST and ERR of a double step."""
+        y = step.end[0]
+        error = self._estimate(y, step.comparison, self._ratios(step))
         norm, index = weighted_rms_norm(
             error, y, self._absolute_tolerance, self._relative_tolerance
         )
-        accepted, following = self._controller.decide(step_size, norm, self._exponents[order])
         limiting = self._names[index]
-        if norm == _INF and first_not_finite(y) is not None:
-            limiting += " is not finite"
-        return Verdict(accepted, following, norm, limiting)
+        bad = first_not_finite(step.end)
+        if bad is not None:
+            return StepError(error, _INF, f"{self._names[bad]} is not finite")
+        return StepError(error, norm, limiting)
+
+    def weights(self, y: FloatArray) -> FloatArray:
+        """1 / (ATOL_j + RTOL_j |y_j|) of equation (8), shape (m,)."""
+        return 1.0 / (self._absolute_tolerance + self._relative_tolerance * np.abs(y))
+
+    def nodes(self, step: DoubleStep) -> StepNodes:
+        """Where the polynomials of a double step met their inputs."""
+        polynomials, ahead = step.polynomials, self._known_ahead
+        begin, middle, end, _, _ = step.times
+        past = step.history.times
+        before = past[1:]
+
+        def nodes(points: tuple[float, ...], known: float) -> list[Nodes]:
+            points = (known, *points) if ahead else points
+            return self._extrapolation.nodes(points, polynomials, begin, ahead)
+
+        first = nodes(before, middle)
+        comparison = nodes(before[::2], end) if self._is_long_step else first
+        return StepNodes(first, nodes(past, end), comparison)
+
+    def _ratios(self, step: DoubleStep) -> FloatArray | float:
+        """P of each output, or one for all."""
+        if self._paper_ratios is not None:
+            ratios = [
+                self._paper_ratios[min([step.polynomials[i].order for i in kinds], default=0)]
+                for kinds, _ in self._combinations
+            ]
+        else:
+            nodes = self.nodes(step)
+            ratios = [
+                self._exact_ratio(step, nodes, kinds, direct)
+                for kinds, direct in self._combinations
+            ]
+        if len(ratios) == 1:
+            return ratios[0]
+        return np.array(ratios)[self._combination_of_output]
+
+    def _exact_ratio(
+        self, step: DoubleStep, nodes: StepNodes, kinds: frozenset[int], direct: bool
+    ) -> float:
+        """P of an output whose slave has inputs of these kinds.
+
+        Several kinds have several constants, and which part of the error comes from which input
+        is not known: the one that makes the estimate largest is taken.
+        """
+        origin = step.times.begin
+        middle, end = step.times.middle - origin, step.times.end - origin
+        candidates = [
+            exact_ratio(
+                nodes.first[i],
+                nodes.second[i],
+                nodes.comparison[i],
+                middle,
+                end,
+                feed_through=direct and not self._ahead[i],
+            )
+            for i in kinds
+        ]
+        return min(candidates, key=lambda p: abs(1.0 - p), default=2.0)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from master_node.configuration import System
+from master_node.numerics.fixed_point import NoFixedPointError, fixed_point
 from master_node.slave_group import Program, SlaveGroup
 from master_node.system import CoupledSystem
 from protocol.calls import ExitInitializationMode, GetOutputs, Initialize, Reply, SetInputs
@@ -21,11 +22,23 @@ _LOOP_ROUNDS = 100
 _LOOP_TOLERANCE = 1e-12
 
 
-def initialize(group: SlaveGroup, coupled: CoupledSystem, system: System) -> FloatArray:
+def initialize(
+    group: SlaveGroup,
+    coupled: CoupledSystem,
+    system: System,
+    get_outputs: Sequence[GetOutputs] | None = None,
+) -> FloatArray:
     """Bring all slaves from instantiated to their first communication point T_0.
 
+    Args:
+        group: the slaves, instantiated.
+        coupled: their connections.
+        system: the settings.
+        get_outputs: for each slave how to read its outputs at T_0; None: values only.
+
     Returns:
-        y(T_0), shape (m,), consistent with the connections.
+        Outputs at T_0, consistent with the connections: values, shape (1, m), or with a second
+        row of derivatives when one of ``get_outputs`` asks for them (0 where it does not).
 
     Raises:
         SlaveError: a slave refused, an output is not finite, or an algebraic loop across slaves
@@ -35,18 +48,27 @@ def initialize(group: SlaveGroup, coupled: CoupledSystem, system: System) -> Flo
     start = float(simulation.start_time)
     group.execute_all([_initialize(part.name, coupled, system) for part in coupled.parts], start)
     y = _propagate(group, coupled, start)
-    programs = [(ExitInitializationMode(), GetOutputs()) for _ in coupled.parts]
-    y = gather(group.execute_all(programs, start), -1)
-    finite = np.isfinite(y)
+    get_outputs = get_outputs or [GetOutputs()] * len(coupled.parts)
+    programs = [(ExitInitializationMode(), get) for get in get_outputs]
+    replies = group.execute_all(programs, start)
+    y = gather(coupled, replies, -1, 1 + max(get.order for get in get_outputs))
+    finite = np.isfinite(y).all(axis=0)
     if not finite.all():
         name = coupled.output_names[int(np.argmin(finite))]
         raise SlaveError(f"{name} is not finite", phase="initialization", time=start)
     return y
 
 
-def gather(replies: Sequence[Reply], position: int) -> FloatArray:
-    """The outputs at one position of each reply, one after the other, shape (m,)."""
-    return np.concatenate([reply.results[position][0] for reply in replies])  # type: ignore[index]
+def gather(
+    coupled: CoupledSystem, replies: Sequence[Reply], position: int, rows: int = 1
+) -> FloatArray:
+    """The outputs at one position of each reply, shape (rows, m); rows not read are 0."""
+    y = np.zeros((rows, len(coupled.output_names)))
+    for part, reply in zip(coupled.parts, replies, strict=True):
+        values = reply.results[position]
+        assert isinstance(values, np.ndarray)
+        y[: len(values), part.output_slice] = values
+    return y
 
 
 def _initialize(slave: str, coupled: CoupledSystem, system: System) -> Program:
@@ -68,11 +90,11 @@ def _propagate(group: SlaveGroup, coupled: CoupledSystem, start: float) -> Float
     """Y in initialization mode after enough rounds for every level to have settled."""
     starts = np.concatenate([part.input_starts for part in coupled.parts])
     replies = group.execute_all([(GetOutputs(),) for _ in coupled.parts], start)
-    y = gather(replies, -1)
-    if coupled.loop:
+    y: FloatArray = gather(coupled, replies, -1)[0]
+    if coupled.initialization.loop:
         return _iterate(group, coupled, start, y)
-    for level in range(int(coupled.initial_levels.max()) + 1):
-        known = coupled.initial_levels[coupled.source] <= level
+    for level in range(int(coupled.initialization.levels.max()) + 1):
+        known = coupled.initialization.levels[coupled.source] <= level
         y = _round(group, coupled, np.where(known, y[coupled.source], starts), start)
     return y
 
@@ -81,22 +103,24 @@ def _round(group: SlaveGroup, coupled: CoupledSystem, u: FloatArray, start: floa
     programs = [
         (SetInputs(u[np.newaxis, part.input_slice]), GetOutputs()) for part in coupled.parts
     ]
-    return gather(group.execute_all(programs, start), -1)
+    y: FloatArray = gather(coupled, group.execute_all(programs, start), -1)[0]
+    return y
 
 
 def _iterate(group: SlaveGroup, coupled: CoupledSystem, start: float, y: FloatArray) -> FloatArray:
     """Fixed-point iteration for an algebraic loop across slaves."""
-    for _ in range(_LOOP_ROUNDS):
-        following = _round(group, coupled, y[coupled.source], start)
-        change = np.abs(following - y)
-        y = following
-        if not np.isfinite(y).all():
-            break
-        if (change <= _LOOP_TOLERANCE * np.maximum(1.0, np.abs(y))).all():
-            return y
-    raise SlaveError(
-        f"the algebraic loop {' -> '.join(coupled.loop)} did not converge in {_LOOP_ROUNDS} rounds",
-        phase="initialization",
-        time=start,
-        remedy="break the loop, or give start values nearer to its solution",
-    )
+    try:
+        return fixed_point(
+            lambda y: _round(group, coupled, y[coupled.source], start),
+            y,
+            tolerance=_LOOP_TOLERANCE,
+            evaluations=_LOOP_ROUNDS,
+        )
+    except NoFixedPointError as error:
+        raise SlaveError(
+            f"the algebraic loop {' -> '.join(coupled.initialization.loop)} did not converge in "
+            f"{_LOOP_ROUNDS} rounds; residual {np.abs(error.residual).max():.3g}",
+            phase="initialization",
+            time=start,
+            remedy="break the loop, or give start values nearer to its solution",
+        ) from None

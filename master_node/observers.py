@@ -32,6 +32,10 @@ class RunStart:
     outputs: FloatArray
 
 
+Points = tuple[tuple[float, FloatArray], ...]
+"""Times [s] and the outputs there, shape (m,) each."""
+
+
 class Attempt(NamedTuple):
     """One attempted double step (or one single step when there is no estimator).
 
@@ -39,22 +43,24 @@ class Attempt(NamedTuple):
         time: communication point T_n from which it started [s].
         step_size: communication step size H [s], the small one.
         order: degree k of the input polynomials.
+        derivative_points: at how many points they meet derivatives.
         error_norm: ERR of equation (8); NaN when the step gave none, inf when a value was not
             finite.
         accepted: whether the solution moved on.
         limiting_variable: ``slave.variable`` with the largest part in ERR, or a reason why there
             is no ERR; "" when there is no estimator.
-        points: the communication points reached and y there, shape (m,) each; empty when
-            rejected.
+        points: where results are wanted, in (T_n, T_n + 2H], and y there, shape (m,) each: the
+            communication points reached, or those of an output grid; empty when rejected.
     """
 
     time: float
     step_size: float
     order: int
+    derivative_points: int
     error_norm: float
     accepted: bool
     limiting_variable: str
-    points: tuple[tuple[float, FloatArray], ...] = ()
+    points: Points = ()
 
 
 class Outcome(StrEnum):
@@ -86,12 +92,16 @@ class Statistics:
         round_trips: rounds of requests to all slaves between the first and the last step.
         wait_time: seconds in which the master waited for the slaves.
         wall_time: seconds of the whole stepping phase.
+        discontinuities: how many were found or declared.
+        double_steps_at_discontinuities: attempts spent on finding and crossing them.
         time: the last accepted communication point [s].
         smallest_step_size, largest_step_size: over accepted steps [s]; NaN before the first.
     """
 
     communication_steps: int = 0
     rejected_double_steps: int = 0
+    discontinuities: int = 0
+    double_steps_at_discontinuities: int = 0
     round_trips: int = 0
     wait_time: float = 0.0
     wall_time: float = 0.0

@@ -122,7 +122,7 @@ def _title(result: Result, variables: int, shown: int) -> str:
     rejected = int(np.count_nonzero(~result.steps["accepted"]))
     parts = [
         str(result.summary.get("outcome", "run without an end")),
-        f"{len(result.time)} communication points",
+        f"{len(result.time)} points in time",
         f"{rejected} of {len(result.steps)} attempts rejected",
     ]
     if shown < variables:

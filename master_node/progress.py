@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from rich.table import Table
 from rich.text import Text
 
+from master_node.numerics.extrapolation import InputPolynomial
 from master_node.observers import Attempt, RunEnd, RunStart
 
 UPDATE_INTERVAL = 0.1
@@ -72,7 +73,7 @@ class ProgressBar:
             return
         self._draw(
             self._progress,
-            f"t = {self._time:.4g} s  H = {attempt.step_size:.2e} s  k = {attempt.order}"
+            f"t = {self._time:.4g} s  H = {attempt.step_size:.2e} s  k = {_polynomial(attempt)}"
             f"  {self._rejected} rejected",
         )
         self._next_update = monotonic() + UPDATE_INTERVAL
@@ -118,6 +119,7 @@ _FACTS = (
     ("order", "order of the inputs", ""),
     ("communication_steps", "communication steps", ""),
     ("rejected_double_steps", "rejected double steps", ""),
+    ("discontinuities", "discontinuities", ""),
     ("smallest_step_size", "smallest step size", " s"),
     ("largest_step_size", "largest step size", " s"),
     ("round_trips", "round trips", ""),
@@ -162,3 +164,8 @@ def _outcome_style(outcome: object) -> str:
 
 def _text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _polynomial(attempt: Attempt) -> str:
+    """The degree, with a prime for each point at which derivatives are met."""
+    return str(InputPolynomial(attempt.order, attempt.derivative_points))

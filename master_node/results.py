@@ -54,6 +54,7 @@ STEPS_DTYPE = np.dtype(
         ("time", np.float64),
         ("step_size", np.float64),
         ("order", np.int64),
+        ("derivative_points", np.int64),
         ("error_norm", np.float64),
         ("accepted", np.bool_),
         ("limiting_variable", np.object_),
@@ -136,6 +137,7 @@ class ResultsWriter:
         name = attempt.limiting_variable
         steps.append(
             f"{float(attempt.time)!r},{float(attempt.step_size)!r},{attempt.order:d},"
+            f"{attempt.derivative_points:d},"
             f"{float(attempt.error_norm)!r},{'true' if attempt.accepted else 'false'},"
             f"{self._quoted.get(name) or _quote(name)}\n"
         )
@@ -392,6 +394,8 @@ def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> d
             "order": simulation.get("order"),
             "communication_steps": statistics.communication_steps,
             "rejected_double_steps": statistics.rejected_double_steps,
+            "discontinuities": statistics.discontinuities,
+            "double_steps_at_discontinuities": statistics.double_steps_at_discontinuities,
             "smallest_step_size": statistics.smallest_step_size,
             "largest_step_size": statistics.largest_step_size,
             "round_trips": statistics.round_trips,
@@ -447,7 +451,9 @@ class _Steps:
 
     def append(self, attempt: Attempt) -> None:
         a = attempt
-        self._numbers.extend((a.time, a.step_size, a.order, a.error_norm, a.accepted))
+        self._numbers.extend(
+            (a.time, a.step_size, a.order, a.derivative_points, a.error_norm, a.accepted)
+        )
         self._texts.append(self._known.setdefault(a.limiting_variable, a.limiting_variable))
 
     def to_array(self) -> NDArray[np.void]:
@@ -574,11 +580,12 @@ def _read_steps(path: Path) -> _Steps:
                 raise _malformed(path, 1, f"the columns must be {','.join(_STEPS_COLUMNS)}")
             for row in reader:
                 try:
-                    time, step_size, order, error_norm, accepted, text = row
+                    time, step_size, order, points, error_norm, accepted, text = row
                     attempt = Attempt(
                         float(time),
                         float(step_size),
                         int(order),
+                        int(points),
                         float(error_norm),
                         flags[accepted],
                         text,

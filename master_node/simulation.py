@@ -15,6 +15,7 @@ from master_node.observers import Observer, Observers
 from master_node.results import Recording, Result, ResultsWriter
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
+from master_node.step_size_rules import check_step_sizes
 from master_node.system import resolve
 from protocol.slave import SlaveDescription
 
@@ -66,12 +67,13 @@ def run(
 ) -> None:
     """Run a system, streaming into ``directory`` if one is given; raises as `simulate`."""
     settings = settings_of(system, {})
+    check_step_sizes(system)
     writer = None if directory is None else ResultsWriter(directory, settings)
     if writer is not None:
         writer.prepare()
     with _slaves(system, directory, in_process=in_process, launch=launch) as slaves:
         coupled = resolve(system, slaves.descriptions)
-        for warning in check_capabilities(coupled, system.simulation):
+        for warning in check_capabilities(coupled, system):
             log.warning("%s", warning)
         if directory is not None:
             writer = ResultsWriter(directory, settings_of(system, slaves.descriptions))
@@ -99,7 +101,9 @@ def settings_of(system: System, descriptions: Mapping[str, SlaveDescription]) ->
     settings = system.checked().model_dump(mode="json", by_alias=True)
     simulation = system.simulation
     settings["simulation"] |= {
-        "initial_step_size": simulation.step_size,
+        "initial_step_size": simulation.given_step_size,
+        "derivative_points": simulation.polynomial.derivative_points,
+        "initial_history": "rest" if simulation.rests_before_start else "none",
         "smallest_step_size": simulation.smallest,
         "largest_step_size": simulation.largest,
         "slave_tolerance": simulation.slave_relative_tolerance,

@@ -26,6 +26,7 @@ class SlaveGroup:
     def __init__(self, links: Mapping[str, SlaveLink]) -> None:
         self.names = tuple(links)
         self._links = tuple(links.values())
+        self._indices = range(len(self.names))
         self.restart_statistics()
 
     def restart_statistics(self) -> None:
@@ -39,14 +40,19 @@ class SlaveGroup:
         return len(self._links)
 
     def execute(
-        self, programs: Sequence[Program], time: float, step_size: float | None = None
+        self,
+        programs: Sequence[Program],
+        time: float,
+        step_size: float | None = None,
+        slaves: Sequence[int] | None = None,
     ) -> list[Reply]:
-        """Run one program on each slave.
+        """Run one program on each slave, or on some.
 
         Args:
-            programs: one for each slave, in order.
+            programs: one for each of these slaves, in order.
             time: where the run stands [s], for error messages.
             step_size: communication step size H [s], for error messages.
+            slaves: indices of the slaves; None: all.
 
         Returns:
             The replies in order. A reply's own ``error`` is located but not raised.
@@ -57,26 +63,27 @@ class SlaveGroup:
         begin = perf_counter()
         failure: DoublestepError | None = None
         replies = []
-        pending: list[SlaveLink] = []
-        for link, program in zip(self._links, programs, strict=True):
+        pending: list[tuple[int, Program]] = []
+        indices = self._indices if slaves is None else slaves
+        for index, program in zip(indices, programs, strict=True):
             try:
-                link.start(program)
+                self._links[index].start(program)
             except DoublestepError as error:
-                failure = failure or self._located(error, len(pending), program)
+                failure = failure or self._located(error, index, program)
                 break
-            pending.append(link)
-        for index, link in enumerate(pending):
+            pending.append((index, program))
+        for index, program in pending:
             try:
-                reply = link.finish()
+                reply = self._links[index].finish()
             except DoublestepError as error:
-                failure = failure or self._located(error, index, programs[index])
+                failure = failure or self._located(error, index, program)
                 continue
             replies.append(reply)
             statistics = self._statistics[index]
             statistics.requests += 1
             statistics.compute_time += reply.compute_time
             if reply.error is not None:
-                self._located(reply.error, index, programs[index])
+                self._located(reply.error, index, program)
                 reply.error.located(time=time, step_size=step_size)
         self.wait_time += perf_counter() - begin
         self.round_trips += 1
@@ -110,9 +117,3 @@ class SlaveGroup:
                 statistics.do_steps += 1
             elif kind is SetState:
                 statistics.rollbacks += 1
-
-    def count_all(self, do_steps: int, rollbacks: int) -> None:
-        """The same for all slaves, when each executed its whole program."""
-        for statistics in self._statistics:
-            statistics.do_steps += do_steps
-            statistics.rollbacks += rollbacks

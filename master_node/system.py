@@ -41,6 +41,20 @@ class SlavePart:
 
 
 @dataclass(frozen=True)
+class FeedThroughOrder:
+    """In which order outputs follow from inputs that follow from outputs.
+
+    Attributes:
+        levels: the outputs of level l depend on connected inputs fed by outputs of lower levels
+            only; shape (m,); empty if there is an algebraic loop.
+        loop: ``slave.variable`` along an algebraic loop, else empty.
+    """
+
+    levels: NDArray[np.intp]
+    loop: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class CoupledSystem:
     """r slaves, m outputs, n connected inputs.
 
@@ -49,12 +63,11 @@ class CoupledSystem:
         source: for each connected input the index of its output, shape (n,).
         output_names, output_units: ``slave.variable`` and units of the m outputs.
         output_slave: for each output the index of its slave, shape (m,).
+        feed_through: whether an output depends directly on a connected input, shape (m,).
         absolute_tolerance: ATOL_j, scaled by the nominal values, shape (m,), unit [y].
         relative_tolerance: RTOL_j, shape (m,).
-        has_feed_through: whether an output of any slave depends directly on a connected input.
-        initial_levels: in initialization mode the outputs of level l depend on connected inputs
-            fed by outputs of lower levels only; shape (m,); empty if there is an algebraic loop.
-        loop: ``slave.variable`` along an algebraic loop in initialization mode, else empty.
+        initialization, at_point: the order in which values propagate through the slaves in
+            initialization mode and at a communication point.
     """
 
     parts: tuple[SlavePart, ...]
@@ -62,11 +75,11 @@ class CoupledSystem:
     output_names: tuple[str, ...]
     output_units: tuple[str, ...]
     output_slave: NDArray[np.intp]
+    feed_through: NDArray[np.bool_]
     absolute_tolerance: FloatArray
     relative_tolerance: FloatArray
-    has_feed_through: bool
-    initial_levels: NDArray[np.intp]
-    loop: tuple[str, ...]
+    initialization: FeedThroughOrder
+    at_point: FeedThroughOrder
 
 
 def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> CoupledSystem:
@@ -96,7 +109,8 @@ def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> Cou
     sources = [feeding[part.name][variable] for part in parts for variable in part.inputs]
     everything = [(s, v) for s in outputs for v in outputs[s]]
     tolerances = [_tolerance(system, slave, v) for slave, v in everything]
-    levels, loop = _initial_levels(output_index, parts, feeding)
+    initial = {part.name: part.description.initial_feed_through for part in parts}
+    direct = {part.name: part.description.feed_through for part in parts}
     slave_index = {name: i for i, name in enumerate(descriptions)}
     return CoupledSystem(
         parts=parts,
@@ -104,15 +118,17 @@ def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> Cou
         output_names=tuple(f"{slave}.{v.name}" for slave, v in everything),
         output_units=tuple(v.unit for _, v in everything),
         output_slave=np.array([slave_index[slave] for slave, _ in everything], dtype=np.intp),
+        feed_through=np.array(
+            [
+                not set(part.description.feed_through.get(output, ())).isdisjoint(part.inputs)
+                for part in parts
+                for output in part.outputs
+            ]
+        ),
         absolute_tolerance=np.array([absolute for absolute, _ in tolerances]),
         relative_tolerance=np.array([relative for _, relative in tolerances]),
-        has_feed_through=any(
-            set(part.description.feed_through.get(output, ())) & set(part.inputs)
-            for part in parts
-            for output in part.outputs
-        ),
-        initial_levels=levels,
-        loop=loop,
+        initialization=_feed_through_order(output_index, initial, feeding),
+        at_point=_feed_through_order(output_index, direct, feeding),
     )
 
 
@@ -240,19 +256,18 @@ def _tolerance(system: System, slave: str, variable: Variable) -> tuple[float, f
     return atol * variable.nominal, rtol
 
 
-def _initial_levels(
+def _feed_through_order(
     output_index: Mapping[_End, int],
-    parts: tuple[SlavePart, ...],
+    feed_through: Mapping[str, Mapping[str, tuple[str, ...]]],
     feeding: Mapping[str, Mapping[str, _End]],
-) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+) -> FeedThroughOrder:
     depends = {
-        (part.name, output): [
-            feeding[part.name][name]
-            for name in part.description.initial_feed_through.get(output, ())
-            if name in feeding[part.name]
+        (slave, output): [
+            feeding[slave][name]
+            for name in feed_through[slave].get(output, ())
+            if name in feeding[slave]
         ]
-        for part in parts
-        for output in part.outputs
+        for slave, output in output_index
     }
     levels = np.zeros(len(output_index), dtype=np.intp)
     try:
@@ -260,5 +275,6 @@ def _initial_levels(
             below = [levels[output_index[source]] + 1 for source in depends[output]]
             levels[output_index[output]] = max(below, default=0)
     except CycleError as error:
-        return np.empty(0, dtype=np.intp), tuple(f"{s}.{v}" for s, v in error.args[1])
-    return levels, ()
+        loop = tuple(f"{slave}.{variable}" for slave, variable in error.args[1])
+        return FeedThroughOrder(np.empty(0, dtype=np.intp), loop)
+    return FeedThroughOrder(levels, ())

@@ -606,6 +606,7 @@ _CAPABILITY_FIELDS: Mapping[str, _Check] = {
     "can_interpolate_inputs": _boolean,
     "max_output_derivative_order": _integer,
     "can_handle_variable_step_size": _boolean,
+    "outputs_follow_inputs": _boolean,
 }
 _DESCRIPTION_FIELDS: Mapping[str, _Check] = {
     "model": _text,

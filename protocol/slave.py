@@ -68,13 +68,20 @@ class Variable:
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What a slave declares that it can do (FMI 2.0, section 4.3.1)."""
+    """What a slave declares that it can do (FMI 2.0, section 4.3.1).
+
+    Attributes:
+        outputs_follow_inputs: outputs read after ``set_inputs``, without a step in between, belong
+            to the new inputs. FMI 2.0 does not let a master ask for that (section 4.2.4), so an
+            FMU has it only by the word of its user; Python models have it.
+    """
 
     can_get_and_set_state: bool = False
     can_serialize_state: bool = False
     can_interpolate_inputs: bool = False
     max_output_derivative_order: int = 0
     can_handle_variable_step_size: bool = False
+    outputs_follow_inputs: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,7 @@ def _model(description: SlaveDescription) -> Table:
         "interpolates inputs": _yes(can.can_interpolate_inputs),
         "output derivatives up to order": str(can.max_output_derivative_order),
         "variable communication step size": _yes(can.can_handle_variable_step_size),
+        "outputs follow inputs without a step": _yes(can.outputs_follow_inputs),
         "direct feed-through": "; ".join(
             f"{output} of {', '.join(inputs)}"
             for output, inputs in description.feed_through.items()

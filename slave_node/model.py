@@ -164,6 +164,7 @@ def describe(model: type[Model]) -> SlaveDescription:
             can_interpolate_inputs=True,
             max_output_derivative_order=1 if has_output_derivatives else 0,
             can_handle_variable_step_size=True,
+            outputs_follow_inputs=True,
         ),
         feed_through=dict(model.feed_through),
         initial_feed_through=dict(model.feed_through),

@@ -1,18 +1,19 @@
 """EST_Rich and EST_mod: the error of a double step from a comparison solution at T_n + 2H.
 
 Both have the form EST = (y - y_comparison) / (1 - p), where p says how many times larger the
-comparison solution's error is. To leading order the error of an output is proportional to the
-integral of w(s) = prod(s - s_i) over the steps, s_i being the nodes of the input polynomial. On an
-equidistant history s_i = 0, -1, ..., -k (in units of H) that gives for the two small steps
+comparison solution's error is. Let s_i be the nodes of an input polynomial, a node counting once
+more where the derivative is met too, and w(s) = prod(s - s_i). The input is wrong by a multiple of
+w, so to leading order an output without direct feed-through is wrong by a multiple of the integral
+of w over the steps, one with feed-through by a multiple of w at the end:
 
-    2 int_0^1 s (s+1) ... (s+k) ds
+    p = I(comparison) / I(two small steps)
+    no feed-through   I(two small steps) = int_0^H w_A + int_H^2H w_B
+                      I(EST_mod) = int_0^2H w_A         I(EST_Rich) = int_0^2H w_L
+    feed-through      w_A(2H) / w_B(2H)                 w_L(2H) / w_B(2H)
 
-and for the comparison solutions
-
-    EST_Rich   int_0^2 of the product with nodes 0, -2, ..., -2k:     2^(k+2) int_0^1 ...
-    EST_mod    int_0^2 s (s+1) ... (s+k) ds
-
-so p = 2^(k+1) and p = 2, 14/5, 32/9, 1076/251 (the paper, section 2, gives the first three).
+A is the polynomial built at T_n, B the one built at T_n + H, L that of the long step. `exact_ratio`
+computes this for any nodes. On an equidistant history, values only, without feed-through, it gives
+the paper's constants, 2^(k+1) and 2, 14/5, 32/9 (section 2): `paper_ratio`.
 """
 
 from __future__ import annotations
@@ -20,10 +21,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from fractions import Fraction
+from math import sqrt
 
-import numpy as np
-from numpy.typing import NDArray
-
+from master_node.numerics.extrapolation import Nodes
 from protocol.signals import MAX_ORDER, FloatArray
 
 
@@ -43,36 +43,81 @@ class ErrorEstimator:
     Attributes:
         name: as the user writes it.
         comparison: the comparison solution.
-        ratios: p for k = 0, 1, 2, 3: error of the comparison solution over that of the two small
-            steps, on an equidistant history and without direct feed-through.
+        paper_ratios: p for k = 0, 1, 2, 3: error of the comparison solution over that of the two
+            small steps, on an equidistant history, values only and without direct feed-through.
     """
 
     name: str
     comparison: Comparison
-    ratios: tuple[float, ...]
+    paper_ratios: tuple[float, ...]
 
-    def ratio(self, orders: NDArray[np.intp]) -> FloatArray:
-        """The ratio p for each output, shape (m,).
+    def points(self, points: int) -> int:
+        """How deep a history must be for input polynomials through ``points`` points."""
+        return 2 * points - 1 if self.comparison is Comparison.LONG_STEP else points
 
-        Args:
-            orders: degree of the input polynomials of the slave that an output belongs to,
-                shape (m,).
-        """
-        return np.array(self.ratios)[orders]
-
-    def points(self, order: int) -> int:
-        """How many communication points an input polynomial of degree ``order`` needs."""
-        return 2 * order + 1 if self.comparison is Comparison.LONG_STEP else order + 1
-
-    def order(self, order: int, points: int) -> int:
-        """The highest degree up to ``order`` for which ``points`` communication points suffice."""
-        available = (points - 1) // 2 if self.comparison is Comparison.LONG_STEP else points - 1
-        return min(order, available)
+    def available(self, points: int) -> int:
+        """Through how many of ``points`` communication points all its polynomials can go."""
+        return (points + 1) // 2 if self.comparison is Comparison.LONG_STEP else points
 
     @staticmethod
-    def estimate(y: FloatArray, y_comparison: FloatArray, ratio: FloatArray) -> FloatArray:
-        """EST, shape (m,), unit [y]: (y - y_comparison) / (1 - p)."""
+    def estimate(y: FloatArray, y_comparison: FloatArray, ratio: FloatArray | float) -> FloatArray:
+        """EST, shape (m,), unit [y]: (y - y_comparison) / (1 - p).
+
+        Args:
+            y: of the two small steps, shape (m,).
+            y_comparison: the comparison solution, shape (m,).
+            ratio: p, one for all or one for each output, shape (m,).
+        """
         return (y - y_comparison) / (1.0 - ratio)
+
+
+_GAUSS = sqrt(0.6)
+
+
+def node_polynomial(nodes: Nodes, offset: float) -> float:
+    """w(offset) = prod(offset - s_i)."""
+    value = 1.0
+    for node in nodes:
+        value *= offset - node
+    return value
+
+
+def node_integral(nodes: Nodes, begin: float, end: float) -> float:
+    """The integral of w from ``begin`` to ``end``, for at most five nodes.
+
+    Three Gauss points: exact up to rounding for polynomials of degree five.
+    """
+    half, middle = 0.5 * (end - begin), 0.5 * (begin + end)
+    outer = _GAUSS * half
+    return (half / 9.0) * (
+        5.0 * node_polynomial(nodes, middle - outer)
+        + 8.0 * node_polynomial(nodes, middle)
+        + 5.0 * node_polynomial(nodes, middle + outer)
+    )
+
+
+def exact_ratio(
+    first: Nodes, second: Nodes, comparison: Nodes, middle: float, end: float, *, feed_through: bool
+) -> float:
+    """The ratio p for one output, from the nodes of the polynomials that its inputs had.
+
+    Args:
+        first: nodes of the first small step, as offsets from T_n [s].
+        second: nodes of the second one.
+        comparison: nodes of the comparison solution; for EST_mod ``first`` once more.
+        middle: offset of T_n + H [s].
+        end: offset of T_n + 2H [s].
+        feed_through: whether the output depends directly on these inputs.
+    """
+    if feed_through:
+        return node_polynomial(comparison, end) / node_polynomial(second, end)
+    small = small_steps_integral(first, second, middle, end)
+    return node_integral(comparison, 0.0, end) / small
+
+
+def small_steps_integral(first: Nodes, second: Nodes, middle: float, end: float) -> float:
+    """I(two small steps), unit s^(k+2); arguments as for `exact_ratio`."""
+    return node_integral(first, 0.0, middle) + node_integral(second, middle, end)
 
 
 def _node_integral(order: int, end: int) -> Fraction:

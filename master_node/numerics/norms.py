@@ -43,8 +43,8 @@ def weighted_rms_norm(
 
 
 def first_not_finite(y: FloatArray) -> int | None:
-    """The index of the first NaN or infinity in ``y``, shape (m,); None when there is none."""
-    if y.dot(y) < np.inf:
+    """The first output with a NaN or an infinity in ``y``, shape (rows, m); None: there is none."""
+    if np.vdot(y, y) < np.inf:
         return None
-    bad = ~np.isfinite(y)
+    bad = ~np.isfinite(y).all(axis=0)
     return int(bad.argmax()) if bad.any() else None

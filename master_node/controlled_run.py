@@ -1,0 +1,411 @@
+"""A run with error-controlled step sizes: attempt -> judge -> accept or go back.
+
+What is tried next is a value (`_Position`), so a rejected step is one that is not put in its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from master_node.double_step import DoubleStep, DoubleStepper
+from master_node.error_control import ErrorControl, StepError
+from master_node.input_defects import InputDefects
+from master_node.numerics.discontinuities import (
+    NO_JUMP,
+    Bracket,
+    Defects,
+    does_not_shrink,
+    has_jumped_unnoticed,
+    step_within,
+)
+from master_node.numerics.double_step_times import DoubleStepTimes
+from master_node.numerics.error_estimators import ErrorEstimator
+from master_node.numerics.extrapolation import CouplingHistory, Polynomials
+from master_node.numerics.initial_step_size import initial_step_size, trial_step_size
+from master_node.numerics.order_control import DEPTH, OrderMemory
+from master_node.numerics.step_size_controller import (
+    EXPONENTS,
+    NOTHING,
+    ControllerMemory,
+    StepSizeController,
+)
+from master_node.observers import Attempt, Points
+from master_node.order_selection import OrderSelection
+from master_node.result_points import Reached, ResultPoints, count_accepted
+from master_node.run_context import RunContext
+from master_node.step_requests import FailedStep
+from master_node.step_size_rules import step_size_limits
+from protocol.errors import DoublestepError, StepSizeError
+from protocol.signals import FloatArray
+from protocol.slave import StepStatus
+
+_INF = float("inf")
+_TRIALS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class _Position:
+    """Where a run stands and what it will try next.
+
+    Attributes:
+        history: inputs up to T_n.
+        y: outputs at T_n, shape (rows, m).
+        step_size: H that is wanted [s].
+        controller: the step size controller's memory.
+        order: the order control's memory; holds the input polynomial.
+        bracket: of a jump that is being looked for.
+        smooth: step size and largest defect of the last accepted step.
+        errors_in_a_row: attempts that a slave ended with an error.
+    """
+
+    history: CouplingHistory
+    y: FloatArray
+    step_size: float
+    order: OrderMemory
+    controller: ControllerMemory = NOTHING
+    bracket: Bracket = NO_JUMP
+    smooth: tuple[float, float] | None = None
+    errors_in_a_row: int = 0
+
+    @property
+    def time(self) -> float:
+        return self.history.times[0]
+
+
+class ControlledRun:
+    """Double steps with an estimator, from the first communication point to the stop time.
+
+    Args:
+        context: what to run.
+        estimator: EST_Rich or EST_mod.
+
+    Raises:
+        ConfigurationError: no step size follows the rules of all slaves.
+    """
+
+    def __init__(self, context: RunContext, estimator: ErrorEstimator) -> None:
+        settings, coupled, scheme = context.system.simulation, context.coupled, context.scheme
+        self._settings = settings
+        self._start = float(settings.start_time)
+        self._source = coupled.source
+        self._scheme = scheme
+        self._observer = context.observer
+        self._statistics = context.statistics
+        self._estimator = estimator
+        self._limits = step_size_limits(context.system)
+        self._stepper = DoubleStepper(context.group, coupled, scheme, estimator)
+        self._control = ErrorControl(coupled, scheme, estimator, settings.constants)
+        self._defects = InputDefects(coupled, scheme, self._control)
+        present, past = EXPONENTS[settings.controller]
+        self._controller = StepSizeController(
+            settings.alpha,
+            settings.theta_min,
+            settings.theta_max,
+            self._limits.smallest,
+            self._limits.largest,
+            present,
+            past,
+            grows_after_rejection=settings.controller == "elementary",
+        )
+        self._orders = None
+        if settings.order == "auto":
+            self._orders = OrderSelection(
+                coupled,
+                scheme,
+                control=self._control,
+                estimator=estimator,
+                largest=settings.polynomial,
+                alpha=settings.alpha,
+            )
+
+    def run(self, y: FloatArray) -> str:
+        """Step from outputs ``y`` at T_0, shape (rows, m), to the stop time.
+
+        Returns:
+            A slave's wish to end earlier in words, or "".
+
+        Raises:
+            DoublestepError: a slave was lost or failed, or H would have to be too small.
+        """
+        self._results = ResultPoints(
+            self._settings.output_grid, self._scheme.has_derivative, self._start, y
+        )
+        position = self._first_position(y)
+        for target, event in self._targets():
+            while position.time < target:
+                following = self._advance(position, target)
+                if isinstance(following, str):
+                    return following
+                position = following
+            if event is not None:
+                following = self._cross(position, event)
+                if isinstance(following, str):
+                    return following
+                position = following
+        return ""
+
+    def _targets(self) -> Iterator[tuple[float, DoubleStepTimes | None]]:
+        """Where double steps must end: before each declared event, and at the stop time."""
+        for event in sorted(set(map(float, self._settings.events))):
+            crossing = self._limits.crossing(self._start, event)
+            yield crossing.begin, crossing
+        yield self._settings.end, None
+
+    # --- beginnings -----------------------------------------------------------------------------
+
+    def _first_position(self, y: FloatArray) -> _Position:
+        settings, u = self._settings, y[:, self._source]
+        points = (
+            settings.polynomial.points if self._orders is None else settings.polynomial.order + 1
+        )
+        depth = self._estimator.points(points) + self._scheme.known_ahead
+        depth = max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
+        history = CouplingHistory.start(self._start, u, depth)
+        position = _Position(history, y, settings.step_size, self._restarted_order())
+        if settings.initial_step_size is None:
+            position = self._with_initial_step_size(position, self._limits.largest)
+        step_size = self._controller.bounded(position.step_size)
+        if settings.rests_before_start:
+            history = CouplingHistory.at_rest(self._start, u, depth, step_size)
+        return replace(position, history=history, step_size=step_size)
+
+    def _restarted_order(self) -> OrderMemory:
+        if self._orders is None:
+            return OrderMemory(self._settings.polynomial)
+        return self._orders.restart()
+
+    def _with_initial_step_size(self, position: _Position, largest: float) -> _Position:
+        """The position with H from the behaviour of the slaves there, ``largest`` at most [s]."""
+        y, stop = position.y, self._settings.end
+        scale = 1.0 / self._control.weights(y[0])
+        slope = y[1] if len(y) > 1 else None
+        trial = trial_step_size(y[0], slope, scale, stop - self._start)
+        for _ in range(_TRIALS):
+            trial = min(trial, largest, (stop - position.time) / 2.0)
+            times = self._limits.times(
+                self._start, position.time, max(trial, self._limits.smallest), stop
+            )
+            polynomials = self._polynomials(position)
+            step = self._stepper.attempt(position.history, times, polynomials)
+            if isinstance(step, DoubleStep):
+                error = self._control.judge(step)
+                if error.norm < _INF:
+                    step_size = initial_step_size(
+                        y[0],
+                        step.middle[0],
+                        step.end[0],
+                        scale,
+                        trial=times.first,
+                        error_norm=error.norm,
+                        exponent=self._control.exponent(polynomials),
+                    )
+                    bounded = self._controller.bounded(min(step_size, largest))
+                    return replace(position, step_size=bounded)
+            trial = 0.1 * times.first
+        return replace(position, step_size=self._controller.bounded(trial))
+
+    def _polynomials(self, position: _Position) -> Polynomials:
+        points = self._estimator.available(len(position.history.times))
+        return self._scheme.extrapolation.polynomials(position.order.polynomial, points)
+
+    # --- one attempt ----------------------------------------------------------------------------
+
+    def _advance(self, position: _Position, target: float) -> _Position | str:
+        """One double step, or the attempt of one, towards ``target`` [s]."""
+        wanted = step_within(
+            position.bracket, position.time, position.step_size, self._limits.smallest
+        )
+        times = self._limits.times(self._start, position.time, wanted, target)
+        polynomials = self._polynomials(position)
+        step = self._stepper.attempt(position.history, times, polynomials)
+        if isinstance(step, FailedStep):
+            return self._after_failure(position, step, times, polynomials)
+        error = self._control.judge(step)
+        if not self._settings.discontinuities:
+            if error.norm <= 1.0:
+                return self._accept(position, step, error, None)
+            return self._reject(position, step, error, None)
+        defects = self._defects.of(step, position.history, position.y, position.smooth)
+        jumps = (
+            position.bracket.shows_jump(defects)
+            or has_jumped_unnoticed(defects)
+            or does_not_shrink(position.bracket, times.first, defects)
+        )
+        if jumps and self._is_smallest(times):
+            return self._accept_jump(position, step, error, self._defects.name(defects))
+        if error.norm <= 1.0 and not jumps:
+            return self._accept(position, step, error, defects)
+        return self._reject(position, step, error, defects)
+
+    def _accept(
+        self, position: _Position, step: DoubleStep, error: StepError, defects: Defects | None
+    ) -> _Position:
+        self._stepper.accepted()
+        times, polynomials = step.times, step.polynomials
+        history = step.history.pushed(times.end, step.end.take(self._source, axis=1))
+        reached: Reached = ((times.middle, step.middle), (times.end, step.end))
+        order = max(polynomial.order for polynomial in polynomials)
+        self._tell_accepted(step, error, reached, self._results.reached(reached, order))
+        _, following, controller = self._controller.decide(
+            times.first, error.norm, self._control.exponent(polynomials), position.controller
+        )
+        if times.first < position.step_size:  # cut short by a target or a bracket
+            following = max(following, position.step_size)
+        memory = position.order
+        if self._orders is not None:
+            memory, factor = self._orders.choose(memory, step, error, history)
+            if factor is not None:
+                factor = min(factor, self._settings.theta_max)
+                if position.controller.rejected:
+                    factor = min(factor, 1.0)
+                following = self._controller.bounded(times.first * factor)
+                controller = NOTHING
+        bracket = position.bracket
+        if bracket.end is not None:
+            self._statistics.double_steps_at_discontinuities += 1
+            if times.end >= bracket.end:  # a false alarm; points so near say nothing of larger H
+                return _Position(
+                    history.cut(), step.end, position.step_size, self._restarted_order()
+                )
+        smooth = None if defects is None else (times.first, defects.largest)
+        return _Position(
+            history,
+            step.end,
+            following,
+            memory,
+            controller,
+            bracket.after_acceptance(times.end),
+            smooth,
+        )
+
+    def _reject(
+        self, position: _Position, step: DoubleStep, error: StepError, defects: Defects | None
+    ) -> _Position:
+        times, bracket = step.times, position.bracket
+        is_noticed = error.norm > 1.0 or not error.norm < _INF
+        if self._is_smallest(times) and is_noticed:
+            raise self._stuck(error, times)
+        reason = error.limiting_variable
+        if not is_noticed and defects is not None:
+            reason = f"{self._defects.name(defects)} jumps"
+        self._tell_rejected(times, step.polynomials, error.norm, reason)
+        _, following, controller = self._controller.decide(
+            times.first, error.norm, self._control.exponent(step.polynomials), position.controller
+        )
+        if defects is None:
+            return replace(position, step_size=following, controller=controller)
+        is_search = bracket.end is not None or not is_noticed
+        if not is_search and not does_not_shrink(bracket, times.first, defects):
+            if bracket.rejected is None:
+                bracket = bracket._replace(rejected=(times.first, defects.largest))
+            return replace(position, step_size=following, controller=controller, bracket=bracket)
+        self._statistics.double_steps_at_discontinuities += 1
+        return replace(position, bracket=bracket.after_rejection(times, defects))
+
+    def _after_failure(
+        self,
+        position: _Position,
+        failed: FailedStep,
+        times: DoubleStepTimes,
+        polynomials: Polynomials,
+    ) -> _Position | str:
+        if failed.status is StepStatus.TERMINATED:
+            return f"{failed.slave} ended the simulation after t={times.begin!r} s"
+        errors_in_a_row = position.errors_in_a_row + (failed.error is not None)
+        if failed.error is not None and errors_in_a_row > 1:
+            raise failed.error
+        self._tell_rejected(times, polynomials, _INF, failed.reason)
+        if self._is_smallest(times):
+            raise failed.error or self._stuck_for(failed.reason, times)
+        return replace(
+            position,
+            step_size=self._controller.after_discard(times.first, failed.reached),
+            controller=position.controller._replace(rejected=True),
+            errors_in_a_row=errors_in_a_row,
+        )
+
+    def _is_smallest(self, times: DoubleStepTimes) -> bool:
+        return times.first <= self._limits.smallest
+
+    def _stuck(self, error: StepError, times: DoubleStepTimes) -> DoublestepError:
+        reason = error.limiting_variable
+        if error.norm < _INF:
+            reason = f"ERR = {error.norm:.3g}, most of it from {reason}"
+        return self._stuck_for(reason, times)
+
+    def _stuck_for(self, reason: str, times: DoubleStepTimes) -> DoublestepError:
+        remedy = "raise the tolerances or lower smallest_step_size"
+        if self._limits.smallest == self._limits.largest:
+            remedy = "raise the tolerances: a slave takes no other step size"
+        return StepSizeError(
+            f"rejected at the smallest communication step size: {reason}",
+            phase="double step",
+            time=times.begin,
+            step_size=times.first,
+            remedy=remedy,
+        )
+
+    # --- discontinuities ------------------------------------------------------------------------
+
+    def _cross(self, position: _Position, times: DoubleStepTimes) -> _Position | str:
+        """The double step over a declared event, whatever its error is."""
+        polynomials = self._polynomials(position)
+        step = self._stepper.attempt(position.history, times, polynomials)
+        if isinstance(step, FailedStep):
+            following = self._after_failure(position, step, times, polynomials)
+            assert isinstance(following, str)  # such a small step is not made smaller
+            return following
+        error = self._control.judge(step)
+        if not error.norm < _INF:
+            raise self._stuck(error, times)
+        return self._accept_jump(position, step, error, "event")
+
+    def _accept_jump(
+        self, position: _Position, step: DoubleStep, error: StepError, name: str
+    ) -> _Position:
+        """Go on behind a discontinuity: history cut, order and step size as at the start."""
+        if not error.norm < _INF:
+            raise self._stuck(error, step.times)
+        self._stepper.accepted()
+        self._statistics.discontinuities += 1
+        self._statistics.double_steps_at_discontinuities += 1
+        times = step.times
+        reached: Reached = ((times.middle, step.middle), (times.end, step.end))
+        error = error._replace(limiting_variable=name if name == "event" else f"{name} jumps")
+        self._tell_accepted(step, error, reached, self._results.jumped(reached))
+        history = step.history.pushed(times.end, step.end.take(self._source, axis=1)).cut()
+        behind = _Position(history, step.end, position.step_size, self._restarted_order())
+        if times.end >= self._settings.end:
+            return behind
+        return self._with_initial_step_size(behind, position.step_size)
+
+    # --- what observers and counters are told ---------------------------------------------------
+
+    def _tell_accepted(
+        self, step: DoubleStep, error: StepError, reached: Reached, points: Points
+    ) -> None:
+        count_accepted(self._statistics, step.times.first, reached)
+        attempt = _attempt(step.times, step.polynomials, error.norm, error.limiting_variable)
+        self._observer.attempted(attempt._replace(accepted=True, points=points))
+
+    def _tell_rejected(
+        self, times: DoubleStepTimes, polynomials: Polynomials, norm: float, reason: str
+    ) -> None:
+        self._statistics.rejected_double_steps += 1
+        self._observer.attempted(_attempt(times, polynomials, norm, reason))
+
+
+def _attempt(
+    times: DoubleStepTimes, polynomials: Polynomials, norm: float, limiting_variable: str
+) -> Attempt:
+    """What observers are told of an attempt; not accepted, unless that is put in its place."""
+    return Attempt(
+        times.begin,
+        times.first,
+        max(polynomial.order for polynomial in polynomials),
+        max(polynomial.derivative_points for polynomial in polynomials),
+        norm,
+        False,
+        limiting_variable,
+    )

@@ -1,0 +1,120 @@
+"""How the slaves of a system are coupled within a step: sequence, input polynomials, outputs read.
+
+Everything here follows from the connections, the slaves' capabilities and the settings, once,
+before the first step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from master_node.configuration import System
+from master_node.numerics.extrapolation import Extrapolation, InputKind
+from master_node.system import CoupledSystem, SlavePart
+from protocol.calls import GetOutputs
+from protocol.signals import MAX_ORDER
+
+
+@dataclass(frozen=True)
+class CouplingScheme:
+    """What the double step and the error estimates need to know of a system.
+
+    Attributes:
+        groups: indices of the slaves that take a step at the same time, group after group: one
+            group of all (Jacobi), or one slave in each (Gauss-Seidel).
+        extrapolation: the inputs' polynomials.
+        input_rows: for each slave how many rows of input derivatives it takes at most.
+        get_outputs: for each slave the call that reads its outputs, with the derivatives where
+            they are of use.
+        output_rows: 2 when outputs are read with derivatives, else 1.
+        has_derivative: for each output whether it is read with its derivative, shape (m,).
+        feed_through: for each output whether it depends directly on extrapolated inputs, shape
+            (m,).
+        evaluated: indices of the slaves whose outputs are evaluated again at communication points.
+        output_kinds: for each output the kinds of its slave's inputs; empty without inputs.
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    extrapolation: Extrapolation
+    input_rows: tuple[int, ...]
+    get_outputs: tuple[GetOutputs, ...]
+    output_rows: int
+    has_derivative: NDArray[np.bool_]
+    feed_through: NDArray[np.bool_]
+    evaluated: tuple[int, ...]
+    output_kinds: tuple[frozenset[int], ...]
+
+    @property
+    def known_ahead(self) -> int:
+        """How many points at the end of a step are known for some inputs before it: 0 or 1."""
+        return int(len(self.groups) > 1)
+
+    @staticmethod
+    def of(coupled: CoupledSystem, system: System) -> CouplingScheme:
+        """The scheme that ``system`` asks for, as far as the slaves can follow."""
+        settings = system.simulation
+        wanted = settings.polynomial
+        indices = range(len(coupled.parts))
+        groups: tuple[tuple[int, ...], ...] = (tuple(indices),)
+        if settings.sequence == "gauss-seidel":
+            groups = tuple((i,) for i in indices)
+        evaluated = _evaluated(coupled, system) if settings.evaluate_outputs else ()
+        feed_through = coupled.feed_through & ~np.isin(coupled.output_slave, evaluated)
+        derivative_orders = [
+            min(1, part.description.capabilities.max_output_derivative_order)
+            if wanted.derivative_points
+            else 0
+            for part in coupled.parts
+        ]
+        reads_derivative = np.array(derivative_orders, dtype=bool)[coupled.output_slave]
+        has_derivative = reads_derivative & ~coupled.feed_through
+        group_of_slave = {slave: i for i, group in enumerate(groups) for slave in group}
+        kinds: list[InputKind] = []
+        kind_of_input = []
+        for target, part in enumerate(coupled.parts):
+            # Interpolated inputs meet values only: with the derivative at the end of the step a
+            # polynomial of degree 1 errs as much in the comparison solution as in the other.
+            for source in coupled.source[part.input_slice]:
+                feeding = int(coupled.output_slave[source])
+                ahead = group_of_slave[feeding] < group_of_slave[target]
+                kind = InputKind(
+                    max_order=min(largest_order(part), wanted.order),
+                    has_derivative=bool(has_derivative[source]) and not ahead,
+                    ahead=ahead,
+                )
+                if kind not in kinds:
+                    kinds.append(kind)
+                kind_of_input.append(kinds.index(kind))
+        kind_array = np.array(kind_of_input, dtype=np.intp)
+        slave_kinds = [frozenset(kind_array[part.input_slice].tolist()) for part in coupled.parts]
+        return CouplingScheme(
+            groups=groups,
+            extrapolation=Extrapolation(kinds or [InputKind(0)], kind_array),
+            input_rows=tuple(largest_order(part) + 1 for part in coupled.parts),
+            get_outputs=tuple(GetOutputs(order) for order in derivative_orders),
+            output_rows=1 + max(derivative_orders),
+            has_derivative=has_derivative,
+            feed_through=feed_through,
+            evaluated=evaluated,
+            output_kinds=tuple(slave_kinds[slave] for slave in coupled.output_slave),
+        )
+
+
+def largest_order(part: SlavePart) -> int:
+    """The highest degree of input polynomial that a slave takes: 0 without canInterpolateInputs."""
+    return MAX_ORDER if part.description.capabilities.can_interpolate_inputs else 0
+
+
+def _evaluated(coupled: CoupledSystem, system: System) -> tuple[int, ...]:
+    slaves: Sequence[int] = np.unique(coupled.output_slave[coupled.feed_through]).tolist()
+    return tuple(slave for slave in slaves if outputs_follow_inputs(coupled.parts[slave], system))
+
+
+def outputs_follow_inputs(part: SlavePart, system: System) -> bool:
+    """Whether a slave's outputs can be read again after its inputs were set, without a step."""
+    stated = system.slaves[part.name].outputs_follow_inputs
+    return part.description.capabilities.outputs_follow_inputs if stated is None else stated

@@ -1,0 +1,192 @@
+"""Which communication step sizes the slaves take at all: bounds, fixed ones, multiples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import ceil, lcm
+from typing import NamedTuple
+
+from master_node.numerics.double_step_times import DoubleStepTimes
+from master_node.numerics.step_size_controller import last_step_size
+
+
+class SlaveLimits(NamedTuple):
+    """The rules of one slave for the size of its do_steps [s]; None: no such rule."""
+
+    name: str
+    step_size: float | None = None
+    step_multiple: float | None = None
+    smallest_step_size: float | None = None
+    largest_step_size: float | None = None
+
+
+class StepSizeLimitsError(Exception):
+    """No communication step size follows all rules; the message says which contradict."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepSizeLimits:
+    """What holds for all slaves together.
+
+    Attributes:
+        smallest, largest: bounds of H [s].
+        quantum: every H is a multiple of this [s], in the decimal digits that were given; None:
+            any H.
+    """
+
+    smallest: float
+    largest: float
+    quantum: Fraction | None = None
+
+    @staticmethod
+    def of(
+        slaves: Sequence[SlaveLimits],
+        smallest: float,
+        largest: float,
+        *,
+        long_step: bool,
+        given_by: str = "the simulation",
+    ) -> StepSizeLimits:
+        """The rules of all slaves, within the bounds of the simulation.
+
+        Args:
+            slaves: their rules.
+            smallest: bound of the simulation [s].
+            largest: bound of the simulation [s].
+            long_step: whether steps of 2H are taken too.
+            given_by: what to call the source of these bounds in messages.
+
+        Raises:
+            StepSizeLimitsError: they contradict each other.
+        """
+        longest = 2 if long_step else 1
+        low = max(
+            [(smallest, given_by)]
+            + [(s.smallest_step_size, s.name) for s in slaves if s.smallest_step_size is not None]
+        )
+        high = min(
+            [(largest, given_by)]
+            + [
+                (s.largest_step_size / longest, s.name)
+                for s in slaves
+                if s.largest_step_size is not None
+            ]
+        )
+        multiples = [_decimal(s.step_multiple) for s in slaves if s.step_multiple is not None]
+        quantum = _common(multiples)
+        fixed = _fixed(slaves, multiples, long_step=long_step)
+        if fixed is not None:
+            quantum, low, high = _decimal(fixed[0]), max(low, fixed), min(high, fixed)
+        elif quantum is not None:
+            low = max(low, (float(quantum), "the common multiple"))
+            high = (float(_decimal(high[0]) // quantum * quantum), high[1])
+        if low[0] > high[0]:
+            raise StepSizeLimitsError(
+                f"the smallest step size {low[0]!r} s (of {low[1]}) is above the largest one, "
+                f"{high[0]!r} s (of {high[1]})"
+            )
+        return StepSizeLimits(low[0], high[0], quantum)
+
+    def check_span(self, begin: float, end: float, together: int = 2) -> None:
+        """Whether steps lead from ``begin`` to ``end`` [s], ``together`` of one size each time.
+
+        Raises:
+            StepSizeLimitsError: not with steps that are multiples of the quantum.
+        """
+        if self.quantum is None:
+            return
+        if (_decimal(end) - _decimal(begin)) % (together * self.quantum):
+            number = "even" if together == 2 else "whole"
+            raise StepSizeLimitsError(
+                f"from {begin!r} s to {end!r} s there is no {number} number of steps of "
+                f"{float(self.quantum)!r} s"
+            )
+
+    def times(
+        self, origin: float, begin: float, step_size: float, target: float
+    ) -> DoubleStepTimes:
+        """The next double step, so that the last one ends exactly on ``target``.
+
+        When less than two double steps are left they share what is left, so that the last one is
+        not arbitrarily small.
+
+        Args:
+            origin: from where multiples are counted [s].
+            begin: T_n [s].
+            step_size: H that is wanted [s].
+            target: where double steps must end [s].
+        """
+        if self.quantum is None:
+            size = last_step_size(begin, target, step_size)
+            if size < self.smallest:  # one double step for all that is left is longer
+                size = (target - begin) / 2.0
+            is_last = 2.0 * size >= target - begin
+            return DoubleStepTimes.from_step_size(begin, size, target if is_last else None)
+        quantum, zero = self.quantum, _decimal(origin)
+        done = round((Fraction(begin) - zero) / quantum)
+        left_units = round((Fraction(target) - zero) / quantum) - done
+        units = max(1, int(_decimal(step_size) // quantum))
+        if 2 * units >= left_units:
+            units = max(1, left_units // 2)
+        elif 4 * units > left_units:
+            units = max(1, (left_units // 2 + 1) // 2)
+        size = float(units * quantum)
+        middle = float(zero + (done + units) * quantum)
+        end = float(zero + (done + 2 * units) * quantum)
+        return DoubleStepTimes(begin, middle, end, size, size)
+
+    def crossing(self, origin: float, event: float) -> DoubleStepTimes:
+        """The double step of the smallest size that leads over an event at ``event`` [s].
+
+        Its middle is the event; on a grid, which need not meet the event, its end is the first
+        even multiple of the quantum that is not before it.
+        """
+        size = self.smallest
+        if self.quantum is None:
+            return DoubleStepTimes(event - size, event, event + size, size, size)
+        zero, pair = _decimal(origin), 2 * self.quantum
+        end = zero + pair * ceil((_decimal(event) - zero) / pair)
+        begin, middle = float(end - pair), float(end - self.quantum)
+        return DoubleStepTimes(begin, middle, float(end), size, size)
+
+
+def _fixed(
+    slaves: Sequence[SlaveLimits], multiples: Sequence[Fraction], *, long_step: bool
+) -> tuple[float, str] | None:
+    """The only step size that some slaves take [s], and one of them."""
+    fixed = [(slave.step_size, slave.name) for slave in slaves if slave.step_size is not None]
+    if not fixed:
+        return None
+    size, name = fixed[0]
+    if long_step:
+        raise StepSizeLimitsError(
+            f"{name} takes steps of {size!r} s only, and EST_Rich needs steps of twice the size "
+            "as well"
+        )
+    for other_size, other in fixed[1:]:
+        if other_size != size:
+            raise StepSizeLimitsError(
+                f"{name} takes steps of {size!r} s only, {other} of {other_size!r} s only"
+            )
+    for multiple in multiples:
+        if _decimal(size) % multiple:
+            raise StepSizeLimitsError(
+                f"{name} takes steps of {size!r} s only, which is no multiple of "
+                f"{float(multiple)!r} s"
+            )
+    return size, name
+
+
+def _decimal(value: float) -> Fraction:
+    """The number as it was written: 0.1 is a tenth."""
+    return Fraction(repr(float(value)))
+
+
+def _common(multiples: Sequence[Fraction]) -> Fraction | None:
+    """The smallest number that is a multiple of all."""
+    if not multiples:
+        return None
+    denominator = lcm(*(m.denominator for m in multiples))
+    return Fraction(lcm(*(int(m * denominator) for m in multiples)), denominator)

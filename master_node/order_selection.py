@@ -1,0 +1,185 @@
+"""``order = "auto"`` for one coupled system: hands its grid and its errors to the order control."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from master_node.coupling_scheme import CouplingScheme
+from master_node.double_step import DoubleStep
+from master_node.error_control import ErrorControl, StepError
+from master_node.numerics.error_estimators import (
+    ErrorEstimator,
+    node_polynomial,
+    small_steps_integral,
+)
+from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial, Nodes, Polynomials
+from master_node.numerics.order_control import (
+    Candidate,
+    Choice,
+    OrderMemory,
+    choose,
+    input_magnitudes,
+    ladder,
+)
+from master_node.system import CoupledSystem
+from protocol.signals import FloatArray
+
+
+class OrderSelection:
+    """Chooses the input polynomial of the next double step; outputs are grouped by their slaves.
+
+    Args:
+        coupled: the system.
+        scheme: how its slaves are coupled.
+        control: its error control.
+        estimator: for which the history must suffice.
+        largest: the highest polynomial that may be chosen.
+        alpha: safety factor of the step size controller.
+    """
+
+    def __init__(
+        self,
+        coupled: CoupledSystem,
+        scheme: CouplingScheme,
+        *,
+        control: ErrorControl,
+        estimator: ErrorEstimator,
+        largest: InputPolynomial,
+        alpha: float,
+    ) -> None:
+        self._coupled = coupled
+        self._scheme = scheme
+        self._control = control
+        self._estimator = estimator
+        self._alpha = alpha
+        kinds = scheme.extrapolation.kinds
+        self._ladder = ladder(
+            has_derivatives=any(kind.has_derivative for kind in kinds),
+            derivative_points=largest.derivative_points,
+        )
+        slaves = range(len(coupled.parts))
+        self._slave_of_input = np.repeat(slaves, [len(part.inputs) for part in coupled.parts])
+        kinds_of = {slave: frozenset[int]() for slave in slaves}
+        direct = dict.fromkeys(slaves, False)
+        for slave, output_kinds, feed_through in zip(
+            coupled.output_slave.tolist(),
+            scheme.output_kinds,
+            scheme.feed_through.tolist(),
+            strict=True,
+        ):
+            kinds_of[slave] = output_kinds
+            direct[slave] |= feed_through
+        self._groups = [(min(kinds_of[slave], default=None), direct[slave]) for slave in slaves]
+
+    def restart(self) -> OrderMemory:
+        """The polynomial to begin with, where only one communication point says anything."""
+        polynomial = self._ladder[0]
+        if self._ladder[1].derivative_points:
+            polynomial = self._ladder[1]
+        return OrderMemory(polynomial)
+
+    def choose(
+        self, memory: OrderMemory, step: DoubleStep, error: StepError, history: CouplingHistory
+    ) -> Choice:
+        """After a double step was accepted.
+
+        Args:
+            memory: from the last choice.
+            step: the double step.
+            error: its estimated error.
+            history: up to its end.
+        """
+        coupled = self._coupled
+        slaves = len(coupled.parts)
+        weights = self._control.weights(step.end[0])
+        outputs = len(coupled.output_names)
+        squares = np.bincount(coupled.output_slave, np.square(error.estimate * weights), slaves)
+        magnitudes = input_magnitudes(
+            history, weights[coupled.source], self._slave_of_input, slaves
+        )
+        begin, middle, end, step_size, _ = step.times
+        nodes = self._control.nodes(step)
+        taken = self._candidate(
+            memory.polynomial,
+            step.polynomials,
+            first=nodes.first,
+            second=nodes.second,
+            middle=middle - begin,
+            end=end - begin,
+        )
+        points = self._estimator.available(len(history.times))
+        candidates = [
+            self._next(polynomial, points, history, step_size)
+            for polynomial in self._ladder
+            if abs(polynomial.order - memory.polynomial.order) <= 1
+            and self._is_possible(polynomial, points)
+        ]
+        return choose(
+            memory,
+            candidates,
+            magnitudes,
+            taken=taken,
+            error=np.sqrt(squares / outputs),
+            step_size=step_size,
+            alpha=self._alpha,
+        )
+
+    def _is_possible(self, polynomial: InputPolynomial, points: int) -> bool:
+        """Whether all inputs can have its degree, but for those whose slaves never can."""
+        extrapolation = self._scheme.extrapolation
+        return all(
+            got.order == min(polynomial.order, kind.max_order)
+            for got, kind in zip(
+                extrapolation.polynomials(polynomial, points), extrapolation.kinds, strict=True
+            )
+        )
+
+    def _next(
+        self, polynomial: InputPolynomial, points: int, history: CouplingHistory, step_size: float
+    ) -> Candidate:
+        """A polynomial over the next double step, were it of the same H."""
+        extrapolation, ahead = self._scheme.extrapolation, self._scheme.known_ahead
+        polynomials = extrapolation.polynomials(polynomial, points)
+        now = history.times[0]
+        grid = (now + 2.0 * step_size, now + step_size, *history.times)
+        first = extrapolation.nodes(grid[2 - ahead :], polynomials, now, ahead)
+        second = extrapolation.nodes(grid[1 - ahead :], polynomials, now, ahead)
+        return self._candidate(
+            polynomial,
+            polynomials,
+            first=first,
+            second=second,
+            middle=step_size,
+            end=2.0 * step_size,
+        )
+
+    def _candidate(
+        self,
+        polynomial: InputPolynomial,
+        polynomials: Polynomials,
+        *,
+        first: list[Nodes],
+        second: list[Nodes],
+        middle: float,
+        end: float,
+    ) -> Candidate:
+        sizes = {
+            (kind, direct): abs(
+                node_polynomial(second[kind], end)
+                if direct and not self._scheme.extrapolation.kinds[kind].ahead
+                else small_steps_integral(first[kind], second[kind], middle, end)
+            )
+            for kind, direct in set(self._groups)
+            if kind is not None
+        }
+        return Candidate(
+            polynomial,
+            self._control.exponent(polynomials),
+            np.array([0 if kind is None else polynomials[kind].order for kind, _ in self._groups]),
+            self._array(sizes),
+        )
+
+    def _array(self, sizes: dict[tuple[int, bool], float]) -> FloatArray:
+        return np.array(
+            [0.0 if kind is None else sizes[kind, direct] for kind, direct in self._groups]
+        )

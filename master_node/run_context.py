@@ -1,0 +1,32 @@
+"""What a run is about: the slaves, how they are coupled, and who is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from master_node.configuration import System
+from master_node.coupling_scheme import CouplingScheme
+from master_node.observers import Observer, Statistics
+from master_node.slave_group import SlaveGroup
+from master_node.system import CoupledSystem
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """The parts that `FixedRun` and `ControlledRun` work on.
+
+    Attributes:
+        group: the slaves, at their first communication point.
+        coupled: their connections.
+        scheme: how they are coupled within a step.
+        system: the settings.
+        observer: is told of every step.
+        statistics: are counted up.
+    """
+
+    group: SlaveGroup
+    coupled: CoupledSystem
+    scheme: CouplingScheme
+    system: System
+    observer: Observer
+    statistics: Statistics

@@ -1,0 +1,206 @@
+"""Steps of all slaves as requests: save or restore, set inputs, step, read outputs.
+
+One request to a slave may hold several such pieces. All slaves of a group take theirs at the same
+time; the groups of a Gauss-Seidel sequence follow each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from master_node.coupling_scheme import CouplingScheme
+from master_node.output_evaluation import OutputEvaluation
+from master_node.slave_group import Program, SlaveGroup
+from master_node.system import CoupledSystem
+from protocol.calls import (
+    Call,
+    DoStep,
+    GetOutputs,
+    GetState,
+    Reply,
+    SetInputs,
+    SetState,
+    StepResult,
+)
+from protocol.errors import DoublestepError, StepRejectedError
+from protocol.signals import FloatArray
+from protocol.slave import StepStatus
+
+_AT_POINT = 0
+_HALFWAY = 1
+SAVE_POINT = GetState(_AT_POINT)
+RESTORE_POINT = SetState(_AT_POINT)
+SAVE_HALFWAY = GetState(_HALFWAY)
+RESTORE_HALFWAY = SetState(_HALFWAY)
+
+
+@dataclass(frozen=True, slots=True)
+class FailedStep:
+    """A double step that a slave, or a value that is not finite, broke off.
+
+    Attributes:
+        slave: its name; "" when it was a value that is not finite.
+        status: ``DISCARD`` or ``TERMINATED`` when the slave said so; None after an error or a
+            value that is not finite.
+        reached: which part of its step the slave completed, 0 to 1; NaN when unknown.
+        reason: for ``steps.csv`` and messages: a variable or a slave, and what happened.
+        error: of the slave, if it returned one.
+    """
+
+    slave: str
+    status: StepStatus | None
+    reached: float
+    reason: str
+    error: DoublestepError | None = None
+
+
+Inputs = Callable[[FloatArray], FloatArray]
+"""The input derivatives of all slaves in a step, shape (k + 1, n), from the outputs at its end as
+far as they are known by then, shape (rows, m)."""
+
+
+class Piece(NamedTuple):
+    """One step of all slaves: what comes first, which inputs, which step, which outputs.
+
+    Attributes:
+        before: what each slave does first: save or restore; None: what the last attempt calls for.
+        inputs: see `Inputs`.
+        step: the same for all slaves.
+        get_outputs: for each slave.
+        rows: of its output arrays.
+    """
+
+    before: tuple[Call, ...] | None
+    inputs: Inputs
+    step: DoStep
+    get_outputs: Sequence[GetOutputs]
+    rows: int
+
+
+class BrokenOffError(Exception):
+    """Carries a failed step out of a request."""
+
+    def __init__(self, failed: FailedStep) -> None:
+        super().__init__(failed.reason)
+        self.failed = failed
+
+
+class StepRequests:
+    """Sends the slaves the requests of their steps, and knows which state each has saved.
+
+    Args:
+        group: the slaves, at their first communication point.
+        coupled: their connections.
+        scheme: how they are coupled within a step.
+    """
+
+    def __init__(self, group: SlaveGroup, coupled: CoupledSystem, scheme: CouplingScheme) -> None:
+        self._group = group
+        self._outputs = len(coupled.output_names)
+        self._input_slices = [part.input_slice for part in coupled.parts]
+        self._output_slices = [part.output_slice for part in coupled.parts]
+        self._scheme = scheme
+        self._evaluation = OutputEvaluation(group, coupled, scheme)
+        self.forget()
+
+    def forget(self) -> None:
+        """The state saved at T_n is not needed any more: it is saved anew where a step begins."""
+        self._saved = [False] * len(self._input_slices)
+
+    def take(self, pieces: Sequence[Piece]) -> list[FloatArray]:
+        """Take steps from where the slaves stand.
+
+        Returns:
+            The outputs at the end of each piece, shape (rows, m).
+
+        Raises:
+            BrokenOffError: a slave did not get to the end.
+        """
+        outputs = [np.zeros((piece.rows, self._outputs)) for piece in pieces]
+        if not self._evaluation.is_needed:
+            self._request(pieces, outputs)
+            return outputs
+        for piece, y in zip(pieces, outputs, strict=True):
+            self._request([piece], [y])
+            step = piece.step
+            try:
+                self._evaluation.evaluate(y, step.communication_point, step.step_size)
+            except StepRejectedError as error:
+                failed = FailedStep("", None, float("nan"), error.cause, error)
+                raise BrokenOffError(failed) from None
+        return outputs
+
+    def _request(self, pieces: Sequence[Piece], outputs: Sequence[FloatArray]) -> None:
+        """One request to each slave, group after group; fills ``outputs`` of each piece."""
+        places = []
+        length = 0
+        for piece in pieces:
+            length += (1 if piece.before is None else len(piece.before)) + 3
+            places.append(length - 1)
+        for slaves in self._scheme.groups:
+            inputs = [piece.inputs(y) for piece, y in zip(pieces, outputs, strict=True)]
+            programs = [self._program(slave, pieces, inputs) for slave in slaves]
+            replies = self._group.execute(
+                programs, pieces[0].step.communication_point, pieces[-1].step.step_size, slaves
+            )
+            self._check(slaves, programs, replies)
+            for slave, reply in zip(slaves, replies, strict=True):
+                columns = self._output_slices[slave]
+                for y, place in zip(outputs, places, strict=True):
+                    values: Any = reply.results[place]
+                    y[: len(values), columns] = values
+
+    def _program(
+        self, slave: int, pieces: Sequence[Piece], inputs: Sequence[FloatArray]
+    ) -> Program:
+        rows, columns = self._scheme.input_rows[slave], self._input_slices[slave]
+        calls: list[Call] = []
+        for piece, derivatives in zip(pieces, inputs, strict=True):
+            if piece.before is None:
+                calls.append(RESTORE_POINT if self._saved[slave] else SAVE_POINT)
+            else:
+                calls.extend(piece.before)
+            calls += (
+                SetInputs(derivatives[:rows, columns]),
+                piece.step,
+                piece.get_outputs[slave],
+            )
+        return tuple(calls)
+
+    def _check(
+        self, slaves: Sequence[int], programs: Sequence[Program], replies: Sequence[Reply]
+    ) -> None:
+        """Count what was executed.
+
+        Raises:
+            BrokenOffError: a slave did not get to the end.
+            DoublestepError: its error is one that a smaller step cannot help.
+        """
+        failures = []
+        for slave, program, reply in zip(slaves, programs, replies, strict=True):
+            done = program[: len(reply.results)]
+            self._group.count(slave, done)
+            if done and done[0] is SAVE_POINT:
+                self._saved[slave] = True
+            if len(done) == len(program):
+                continue
+            if reply.error is not None and not isinstance(reply.error, StepRejectedError):
+                raise reply.error
+            failures.append(_failure(self._group.names[slave], program, reply))
+        if failures:
+            terminated = [f for f in failures if f.status is StepStatus.TERMINATED]
+            raise BrokenOffError((terminated or failures)[0])
+
+
+def _failure(slave: str, program: Program, reply: Reply) -> FailedStep:
+    if reply.error is not None:
+        return FailedStep(slave, None, float("nan"), f"{slave}: {reply.error.cause}", reply.error)
+    call, result = program[len(reply.results) - 1], reply.results[-1]
+    assert isinstance(call, DoStep)
+    assert isinstance(result, StepResult)
+    reached = (result.time - call.communication_point) / call.step_size
+    return FailedStep(slave, result.status, reached, f"{slave}: {result.status}")

@@ -1,0 +1,81 @@
+"""From the settings of a system to the communication step sizes that suit all its slaves."""
+
+from __future__ import annotations
+
+from master_node.configuration import System
+from master_node.numerics.step_size_limits import (
+    SlaveLimits,
+    StepSizeLimits,
+    StepSizeLimitsError,
+)
+from protocol.errors import ConfigurationError
+
+
+def step_size_limits(system: System) -> StepSizeLimits:
+    """What the simulation's settings and the slaves' rules leave for H.
+
+    Raises:
+        ConfigurationError: nothing.
+    """
+    settings = system.simulation
+    limits = _limits(
+        system, settings.smallest, settings.largest, long_step=settings.estimator == "rich"
+    )
+    reached = start = float(settings.start_time)
+    for event in sorted(settings.events):
+        crossing = limits.crossing(start, float(event))
+        if crossing.begin <= reached or crossing.end >= settings.end:
+            raise ConfigurationError(
+                f"{system.source}: [simulation] events: {event!r} is too near to another event or "
+                "to an end of the simulated time"
+            )
+        reached = crossing.end
+    return limits
+
+
+def check_step_sizes(system: System) -> None:
+    """Whether there are step sizes that suit all slaves, before any of them is started.
+
+    Raises:
+        ConfigurationError: there are none.
+    """
+    if system.simulation.estimator == "none":
+        step_size = system.simulation.step_size
+        _limits(
+            system,
+            step_size,
+            step_size,
+            long_step=False,
+            given_by="the fixed step, initial_step_size or --step-size",
+        )
+    else:
+        step_size_limits(system)
+
+
+def _limits(
+    system: System,
+    smallest: float,
+    largest: float,
+    *,
+    long_step: bool,
+    given_by: str = "the simulation",
+) -> StepSizeLimits:
+    rules = [
+        SlaveLimits(
+            name,
+            slave.step_size,
+            slave.step_multiple,
+            slave.smallest_step_size,
+            slave.largest_step_size,
+        )
+        for name, slave in system.slaves.items()
+    ]
+    try:
+        limits = StepSizeLimits.of(rules, smallest, largest, long_step=long_step, given_by=given_by)
+        together = 1 if system.simulation.estimator == "none" else 2
+        limits.check_span(float(system.simulation.start_time), system.simulation.end, together)
+    except StepSizeLimitsError as error:
+        raise ConfigurationError(
+            f"{system.source}: no communication step size suits all: {error}"
+        ) from None
+    return limits
