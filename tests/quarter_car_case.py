@@ -9,7 +9,7 @@ import inspect
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,13 @@ from scipy.linalg import expm
 
 from master_node import Result, System
 from master_node.co_simulation import CoSimulation, check_capabilities
+from master_node.coupling_scheme import CouplingScheme
+from master_node.double_step import DoubleStep, DoubleStepper
+from master_node.error_control import ErrorControl
+from master_node.initialization import initialize
+from master_node.numerics.double_step_times import DoubleStepTimes
+from master_node.numerics.error_estimators import ESTIMATORS
+from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
 from master_node.observers import Observer, Observers
 from master_node.results import Recording
 from master_node.simulation import settings_of
@@ -25,6 +32,7 @@ from master_node.slave_group import SlaveGroup
 from master_node.slave_link import LocalSlave
 from master_node.system import CoupledSystem, resolve
 from protocol.calls import StepResult
+from protocol.signals import InputSignal
 from protocol.slave import (
     Capabilities,
     Causality,
@@ -65,13 +73,15 @@ def exact_solution(t: float | np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LinearSystem:
-    """x' = A x + B u + c, of which all states are outputs."""
+    """x' = A x + B u + c and y = C x + D u; without C and D all states are outputs."""
 
     a: np.ndarray
     b: np.ndarray
     c: np.ndarray
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    of_states: np.ndarray | None = None
+    of_inputs: np.ndarray | None = None
 
     def propagate(self, x: np.ndarray, u: np.ndarray, time: float) -> np.ndarray:
         """The states after ``time`` [s] with polynomial inputs, row j of ``u`` the j-th derivative.
@@ -84,6 +94,25 @@ class LinearSystem:
         system[n : n + (rows - 1) * m, n + m : n + rows * m] = np.eye((rows - 1) * m)
         reached: np.ndarray = expm(system * time) @ np.concatenate([x, u.ravel(), [1.0]])
         return reached[:n]
+
+    def read(self, x: np.ndarray, u: np.ndarray, order: int) -> np.ndarray:
+        """Outputs and, for order 1, their derivatives, from the states and the inputs' rows."""
+        slopes = np.zeros(u.shape[1]) if len(u) < 2 else u[1]
+        rows = [(x, u[0]), (self.a @ x + self.b @ u[0] + self.c, slopes)][: order + 1]
+        if self.of_states is None or self.of_inputs is None:
+            return np.array([states for states, _ in rows])
+        return np.array([self.of_states @ s + self.of_inputs @ v for s, v in rows])
+
+    @property
+    def feed_through(self) -> dict[str, tuple[str, ...]]:
+        """For each output the inputs that it depends on directly."""
+        if self.of_inputs is None:
+            return {}
+        return {
+            output: tuple(name for name, d in zip(self.inputs, row, strict=True) if d)
+            for output, row in zip(self.outputs, self.of_inputs, strict=True)
+            if row.any()
+        }
 
     def slave(self, x: Sequence[float] | np.ndarray = (0.0, 0.0), **options: Any) -> LinearSlave:
         """A slave that starts at ``x``."""
@@ -106,6 +135,31 @@ WHEEL = LinearSystem(
 )
 
 
+CHASSIS_FORCE = LinearSystem(
+    a=np.array([[0.0, 1.0], [0.0, 0.0]]),
+    b=np.array([[0.0], [1.0 / M_C]]),
+    c=np.zeros(2),
+    inputs=("F",),
+    outputs=("x", "v"),
+)
+WHEEL_FORCE = LinearSystem(
+    a=WHEEL.a,
+    b=WHEEL.b,
+    c=WHEEL.c,
+    inputs=WHEEL.inputs,
+    outputs=("x", "v", "F"),
+    of_states=np.array([[1.0, 0.0], [0.0, 1.0], [K_C, D_C]]),
+    of_inputs=np.array([[0.0, 0.0], [0.0, 0.0], [-K_C, -D_C]]),
+)
+
+ALL = Capabilities(
+    can_get_and_set_state=True,
+    can_interpolate_inputs=True,
+    can_handle_variable_step_size=True,
+)
+"""What error control needs, and nothing more: outputs without derivatives."""
+
+
 class LinearSlave(Slave):
     """A `LinearSystem` as a slave, propagated exactly. Counts its saved states."""
 
@@ -121,12 +175,9 @@ class LinearSlave(Slave):
                 *(Variable(name, Causality.INPUT, start=0.0) for name in system.inputs),
                 *(Variable(name, Causality.OUTPUT) for name in system.outputs),
             ),
-            capabilities=capabilities
-            or Capabilities(
-                can_get_and_set_state=True,
-                can_interpolate_inputs=True,
-                can_handle_variable_step_size=True,
-            ),
+            capabilities=capabilities or ALL,
+            feed_through=system.feed_through,
+            initial_feed_through=system.feed_through,
             state_kind="native",
         )
         self.saved: list[object] = []
@@ -165,12 +216,13 @@ class LinearSlave(Slave):
     ) -> StepResult:
         """See `Slave`."""
         self.x = self.system.propagate(self.x, self.u, step_size)
+        self.u = InputSignal(self.u).shifted(step_size).derivatives
         return StepResult(StepStatus.OK, communication_point + step_size)
 
     def get_outputs(self, order: int) -> np.ndarray:
         """See `Slave`."""
-        assert order == 0
-        return self.x[np.newaxis].copy()
+        assert order <= self.description.capabilities.max_output_derivative_order
+        return self.system.read(self.x, self.u, order)
 
     def get_state(self) -> object:
         """See `Slave`."""
@@ -257,7 +309,7 @@ def run_slaves(
             executors[name] = Executor(slave)
             stack.callback(executors[name].close)
         coupled = resolve(system, {name: e.description for name, e in executors.items()})
-        warnings = check_capabilities(coupled, system.simulation)
+        warnings = check_capabilities(coupled, system)
         recording = Recording(settings_of(system, {}))
         group = SlaveGroup({name: LocalSlave(e) for name, e in executors.items()})
         failure: Exception | None = None
@@ -278,3 +330,119 @@ def global_errors(result: Result) -> np.ndarray:
     """The Euclidean norm of the four states' error at each communication point, shape (n,)."""
     states = np.stack([result[name] for name in STATES], axis=1)
     return np.asarray(np.linalg.norm(states - exact_solution(result.time), axis=1))
+
+
+# ---- One double step from exact data ------------------------------------------------------------
+
+WHOLE_CAR = LinearSystem(
+    a=np.block([[CHASSIS.a, CHASSIS.b], [WHEEL.b, WHEEL.a]]),
+    b=np.zeros((4, 0)),
+    c=np.array([0.0, 0.0, 0.0, K_W * Z / M_W]),
+    inputs=(),
+    outputs=STATES,
+)
+
+
+def exact_outputs(names: Sequence[str], time: float) -> np.ndarray:
+    """Values and derivatives of some outputs of the exact solution, shape (2, m)."""
+    x = exact_solution(time)[0]
+    states = np.array([x, WHOLE_CAR.a @ x + WHOLE_CAR.c])
+    columns = dict(zip(STATES, states.T, strict=True))
+    columns["wheel.F"] = K_C * (columns["wheel.x"] - columns["chassis.x"]) + D_C * (
+        columns["wheel.v"] - columns["chassis.v"]
+    )
+    return np.stack([columns[name] for name in names], axis=1)
+
+
+@dataclass(frozen=True)
+class LocalError:
+    """A double step from the exact solution with an exact history, shape (m,) each."""
+
+    names: tuple[str, ...]
+    estimate: np.ndarray
+    error: np.ndarray
+    step: DoubleStep
+
+    def deviation(self, *names: str) -> float:
+        """How far the estimates of some outputs are from the true errors, relative to these.
+
+        In the norm of all of them. A single one may be slower where its leading term happens to
+        be small, and a displacement is one integration further from the inputs than a velocity,
+        so its error is one order smaller, with a constant of its own.
+        """
+        columns = [self.names.index(name) for name in names]
+        difference = np.linalg.norm((self.estimate - self.error)[columns])
+        return float(difference / np.linalg.norm(self.error[columns]))
+
+
+def local_error(
+    polynomial: InputPolynomial,
+    step_size: float,
+    *,
+    time: float = 0.3,
+    last_step_size: float | None = None,
+    parts: Mapping[str, LinearSystem] | None = None,
+    connections: Iterable[tuple[str, str]] = DISPLACEMENT,
+    capabilities: Capabilities | None = None,
+    **simulation: Any,
+) -> LocalError:
+    """Take a double step of the program from ``time`` [s] and compare it with the exact solution.
+
+    Slaves are propagated exactly, so that the inputs' polynomials are all the error there is. The
+    history is that of steps of ``last_step_size`` [s], by default the same as ``step_size``.
+    """
+    parts = parts or {"chassis": CHASSIS, "wheel": WHEEL}
+    can = capabilities or replace(ALL, max_output_derivative_order=1)
+    settings = {
+        "start_time": time,
+        "stop_time": time + 1.0,
+        "order": polynomial.order,
+        "derivative_points": polynomial.derivative_points,
+        **simulation,
+    }
+    system = System(
+        simulation=settings, slaves={name: {} for name in parts}, connections=connections
+    )
+    executors = {}
+    for name, part in parts.items():
+        x = exact_outputs([f"{name}.x", f"{name}.v"], time)[0]
+        executors[name] = Executor(part.slave(x, capabilities=can))
+    coupled = resolve(system, {name: e.description for name, e in executors.items()})
+    scheme = CouplingScheme.of(coupled, system)
+    group = SlaveGroup({name: LocalSlave(e) for name, e in executors.items()})
+    initialize(group, coupled, system, scheme.get_outputs)
+    estimator = ESTIMATORS[system.simulation.estimator]
+    sources = [coupled.output_names[i] for i in coupled.source]
+    points = estimator.points(polynomial.order + 1) + 1
+    past = [time - i * (last_step_size or step_size) for i in range(points)]
+    history = CouplingHistory.start(past[-1], exact_outputs(sources, past[-1]), points)
+    for point in past[-2::-1]:
+        history = history.pushed(point, exact_outputs(sources, point))
+    polynomials = scheme.extrapolation.polynomials(polynomial, estimator.available(points))
+    stepper = DoubleStepper(group, coupled, scheme, estimator)
+    times = DoubleStepTimes.from_step_size(time, step_size)
+    step = stepper.attempt(history, times, polynomials)
+    assert isinstance(step, DoubleStep), step
+    control = ErrorControl(coupled, scheme, estimator, system.simulation.constants)
+    exact = exact_outputs(coupled.output_names, times.end)[0]
+    return LocalError(coupled.output_names, control.judge(step).estimate, step.end[0] - exact, step)
+
+
+SIZES = {0: (0.4e-3, 0.2e-3), 1: (0.4e-3, 0.2e-3), 2: (0.4e-3, 0.2e-3), 3: (0.5e-3, 0.25e-3)}
+"""For each order two step sizes [s], small enough for the leading terms, large enough for them to
+be above rounding."""
+
+
+def limit_of_deviations(
+    polynomial: InputPolynomial, factor: float, outputs: Sequence[str] = STATES, **options: Any
+) -> tuple[float, float]:
+    """How far estimate and true error are from each other, at a small H and as H -> 0.
+
+    After a history of steps of H / ``factor``. The deviation being of first order in H, its limit
+    is found by extrapolation.
+    """
+    deviations = [
+        local_error(polynomial, h, last_step_size=h / factor, **options).deviation(*outputs)
+        for h in SIZES[polynomial.order]
+    ]
+    return deviations[1], 2.0 * deviations[1] - deviations[0]

@@ -82,3 +82,29 @@ class Sleeper(_Chassis):
                 Path(self.bed).touch()
             sleep(self.nap)
         return list(super().derivatives(t, x, u))
+
+
+class Filter(Model):
+    """x' = u - x and y = x + gain u: its output follows its input at once, and late."""
+
+    inputs = (real("u"),)
+    outputs = (real("y"),)
+    states = (real("x", start=1.0),)
+    parameters = (real("gain", start=0.5),)
+    feed_through = {"y": ("u",)}  # noqa: RUF012  as a user writes it
+
+    def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
+        """The state."""
+        return [u[0] - x[0]]
+
+    def output_values(self, t: float, x: Any, u: Any) -> list[float]:
+        """The output."""
+        return [x[0] + self.gain * u[0]]
+
+
+class LateLoop(Filter):
+    """From t = 0.5 s on y = x + u: two of them contain each other without a solution."""
+
+    def output_values(self, t: float, x: Any, u: Any) -> list[float]:
+        """The output."""
+        return [x[0] + (self.gain if t < 0.5 else 1.0) * u[0]]

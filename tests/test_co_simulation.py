@@ -136,7 +136,7 @@ TABLE_1 = {  # accepted small steps, rejected double steps, mean error
 def test_table_1_of_the_paper(estimator: str, k: int, fmu_dir: Path) -> None:
     """The paper's benchmark on the FMUs: steps within 15 %, errors at most 1.5 times its own."""
     steps, rejections, error = TABLE_1[estimator, k]
-    result = completed(run_slaves(fmu_car(fmu_dir, estimator=estimator, order=k)))
+    result = completed(run_slaves(fmu_car(fmu_dir, preset="paper", estimator=estimator, order=k)))
     summary = result.summary
     assert summary["communication_steps"] == pytest.approx(steps, rel=0.15)
     assert summary["rejected_double_steps"] <= rejections + 10
@@ -146,22 +146,29 @@ def test_table_1_of_the_paper(estimator: str, k: int, fmu_dir: Path) -> None:
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_the_tolerance_controls_the_error(estimator: str, fmu_dir: Path) -> None:
-    """Law: a tolerance 10 times smaller makes the error about 10 times smaller, on and on."""
+@pytest.mark.parametrize("how", [{"preset": "paper", "order": 2}, {"order": 2}, {"order": "auto"}])
+def test_the_tolerance_controls_the_error(
+    estimator: str, how: dict[str, Any], fmu_dir: Path
+) -> None:
+    """Law: a tolerance 10 times smaller makes the error about 10 times smaller, on and on.
+
+    The error of a double step is kept at the tolerance, so with k = 2 the global error falls with
+    its power (k + 1) / (k + 2) = 0.75.
+    """
     tolerances = [1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8]
     errors = []
     for tolerance in tolerances:
         system = fmu_car(
             fmu_dir,
             estimator=estimator,
-            order=2,
             stop_time=1.0,
             relative_tolerance=tolerance,
             absolute_tolerance=tolerance,
+            **how,
         )
         errors.append(global_errors(completed(run_slaves(system))).mean())
     slope = np.polyfit(np.log10(tolerances), np.log10(errors), 1)[0]
-    assert 0.75 < slope < 1.25
+    assert 0.65 < slope < 1.25
     assert all(3.0 < a / b < 30.0 for a, b in pairwise(errors))
 
 
@@ -203,7 +210,13 @@ def test_reject_then_accept_ends_in_the_same_bits(estimator: str, k: int, fmu_di
     A first step that is too long is rejected; the run goes on bit for bit as one that starts
     with the smaller step. (Without a history at rest, whose points are H_0 apart.)
     """
-    options = {"estimator": estimator, "order": k, "initial_history": "none", "stop_time": 0.3}
+    options = {
+        "preset": "paper",  # what is learnt from a rejection would be used later on
+        "estimator": estimator,
+        "order": k,
+        "initial_history": "none",
+        "stop_time": 0.3,
+    }
     long = completed(run_slaves(fmu_car(fmu_dir, initial_step_size=0.05, **options)))
     first = int(np.argmax(long.steps["accepted"]))
     assert first > 0
@@ -262,7 +275,7 @@ def test_saved_states_are_few_and_all_freed(estimator: str) -> None:
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_step_sizes_follow_the_controller(estimator: str, fmu_dir: Path) -> None:
     """Every H is what the paper's formula makes of the attempt before it, with P = k + 2."""
-    result = completed(run_slaves(fmu_car(fmu_dir, estimator=estimator, order=1)))
+    result = completed(run_slaves(fmu_car(fmu_dir, preset="paper", estimator=estimator, order=1)))
     assert_controlled(result, exponent=3)
 
 
@@ -294,6 +307,7 @@ def test_displacement_force_has_one_order_less(estimator: str, k: int, fmu_dir: 
         "wheel_force.fmu",
         base=fmu_dir,
         connections=FORCE,
+        preset="paper",
         estimator=estimator,
         order=k,
         stop_time=0.4,
@@ -302,7 +316,7 @@ def test_displacement_force_has_one_order_less(estimator: str, k: int, fmu_dir: 
     )
     run = run_slaves(system)
     result = completed(run)
-    assert run.coupled.has_feed_through
+    assert run.coupled.feed_through.any()
     assert_controlled(result, exponent=k + 1)
     exact = exact_solution(result.time)
     assert np.abs(result["chassis.x"] - exact[:, 0]).max() < 2e-3
@@ -512,7 +526,8 @@ def test_a_slave_that_takes_no_derivatives_gets_order_0(estimator: str, k: int) 
     """
     simple = Capabilities(can_get_and_set_state=True, can_handle_variable_step_size=True)
     slaves = {"chassis": CHASSIS.slave(), "wheel": WHEEL.slave(capabilities=simple)}
-    run = run_slaves(car(estimator=estimator, order=k, stop_time=0.2), slaves)
+    options = {"preset": "paper", "estimator": estimator, "order": k, "stop_time": 0.2}
+    run = run_slaves(car(**options), slaves)
     result = completed(run)
     warning = (
         "wheel cannot interpolate inputs (canInterpolateInputs): its inputs are held constant "
@@ -678,11 +693,31 @@ def test_an_algebraic_loop_is_solved() -> None:
     assert result.outputs[-1] == pytest.approx([4 / 3, 2 / 3], rel=1e-8)
 
 
-@pytest.mark.parametrize("gain", [2.0, -1.0, 1e200])
-def test_an_algebraic_loop_that_does_not_converge_is_named(gain: float) -> None:
-    """Slaves and variables along the loop, the phase and the remedy; no step is tried."""
+@pytest.mark.parametrize("gain", [2.0, -1.0, 30.0])
+def test_an_algebraic_loop_is_solved_where_the_plain_iteration_diverges(gain: float) -> None:
+    """y_a = g y_b + 1 and y_b = 1.5 g y_a: the loop's gain 1.5 g^2 is above 1.
+
+    At T_0, and with ``evaluate_outputs`` at every communication point.
+    """
     system = gains(
         ("a.y", "b.u"), ("b.y", "a.u"), a={"gain": gain, "offset": 1.0}, b={"gain": gain * 1.5}
+    )
+    y_a = 1.0 / (1.0 - 1.5 * gain**2)
+    for estimator in ("none", "mod", "rich"):
+        options = {"evaluate_outputs": True, "estimator": estimator}
+        result = completed(run_slaves(system.with_simulation(**options)))
+        for row in result.outputs[[0, len(result.time) // 2, -1]]:
+            assert row == pytest.approx([y_a, 1.5 * gain * y_a], rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("gain", [1.0, 1e200])
+def test_an_algebraic_loop_that_does_not_converge_is_named(gain: float) -> None:
+    """Slaves and variables along the loop, the phase and the remedy; no step is tried.
+
+    With a gain of 1 all around there is no solution; with 1e400 no number.
+    """
+    system = gains(
+        ("a.y", "b.u"), ("b.y", "a.u"), a={"gain": gain, "offset": 1.0}, b={"gain": gain}
     )
     with pytest.raises(SlaveError, match=re.escape("the algebraic loop ")) as info:
         run_slaves(system)

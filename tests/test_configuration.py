@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from master_node import BusSettings, SimulationSettings, System, load_system
 from master_node.configuration import OutputTolerance, SlaveSettings
+from master_node.numerics.extrapolation import InputPolynomial
 from master_node.simulation import settings_of
 from master_node.slaves import slaves_on_bus
 from protocol.errors import ConfigurationError
@@ -81,7 +82,14 @@ def test_a_file_is_read_as_it_is_written(tmp_path: Path) -> None:
     stop_time = 5
     initial_step_size = 0.25
     order = 3
+    derivative_points = 2
     estimator = "rich"
+    constants = "exact"
+    controller = "elementary"
+    sequence = "gauss-seidel"
+    evaluate_outputs = true
+    discontinuities = false
+    events = [2, 3.5]
     relative_tolerance = 0
     absolute_tolerance = 1e-6
     slave_tolerance = 1e-8
@@ -91,9 +99,15 @@ def test_a_file_is_read_as_it_is_written(tmp_path: Path) -> None:
     smallest_step_size = 1e-6
     largest_step_size = 0.5
     initial_history = "none"
+    output_interval = 0.125
 
     [slaves.a]
     model = "a.fmu"
+    step_size = 1
+    step_multiple = 0.5
+    smallest_step_size = 1e-3
+    largest_step_size = 2
+    outputs_follow_inputs = true
     parameters = { m = 40.0, n = 3, on = true, name = "text" }
     relative_tolerance = 1e-3
     absolute_tolerance = 1e-2
@@ -119,7 +133,14 @@ def test_a_file_is_read_as_it_is_written(tmp_path: Path) -> None:
         stop_time=5,
         initial_step_size=0.25,
         order=3,
+        derivative_points=2,
         estimator="rich",
+        constants="exact",
+        controller="elementary",
+        sequence="gauss-seidel",
+        evaluate_outputs=True,
+        discontinuities=False,
+        events=(2.0, 3.5),
         relative_tolerance=0,
         absolute_tolerance=1e-6,
         slave_tolerance=1e-8,
@@ -129,10 +150,16 @@ def test_a_file_is_read_as_it_is_written(tmp_path: Path) -> None:
         smallest_step_size=1e-6,
         largest_step_size=0.5,
         initial_history="none",
+        output_interval=0.125,
     )
     assert dict(system.slaves) == {
         "a": SlaveSettings(
             model="a.fmu",
+            step_size=1,
+            step_multiple=0.5,
+            smallest_step_size=1e-3,
+            largest_step_size=2,
+            outputs_follow_inputs=True,
             parameters={"m": 40.0, "n": 3, "on": True, "name": "text"},
             relative_tolerance=1e-3,
             absolute_tolerance=1e-2,
@@ -155,16 +182,45 @@ def test_a_file_is_read_as_it_is_written(tmp_path: Path) -> None:
 
 
 def test_defaults_are_those_that_the_documentation_names(tmp_path: Path) -> None:
-    """The controller within the paper's ranges; slaves integrate two orders below RTOL."""
+    """The order and the first step size are chosen by the system, with all derivatives there are.
+
+    The controller within the paper's ranges; slaves integrate two orders below RTOL.
+    """
     settings = load_system(written(tmp_path, SYSTEM)).simulation
     assert settings.start_time == 0.0
-    assert settings.step_size == pytest.approx(4e-3)
-    assert (settings.order, settings.estimator) == (1, "mod")
+    assert settings.initial_step_size is None
+    assert (settings.order, settings.estimator) == ("auto", "mod")
+    assert (settings.constants, settings.controller) == ("exact", "pi")
+    assert (settings.sequence, settings.evaluate_outputs) == ("jacobi", False)
+    assert (settings.discontinuities, settings.events) == (True, ())
+    assert (settings.preset, settings.output_grid) == (None, None)
+    assert settings.polynomial == InputPolynomial(3, 2)
     assert (settings.relative_tolerance, settings.absolute_tolerance) == (1e-4, 1e-4)
     assert settings.slave_relative_tolerance == pytest.approx(1e-6)
     assert (settings.alpha, settings.theta_min, settings.theta_max) == (0.85, 0.3, 2.0)
     assert (settings.smallest, settings.largest) == pytest.approx((4e-9, 2.0))
-    assert settings.initial_history == "rest"
+    assert not settings.rests_before_start
+
+
+def test_a_given_order_is_that_of_the_paper_unless_more_is_asked_for(tmp_path: Path) -> None:
+    """Values only, from a history at rest; derivatives and another history where they are named."""
+    settings = load_system(written(tmp_path, simulation("order = 2"))).simulation
+    assert settings.polynomial == InputPolynomial(2, 0)
+    assert settings.rests_before_start
+    more = load_system(
+        written(tmp_path, simulation('order = 2\nderivative_points = 1\ninitial_history = "none"'))
+    ).simulation
+    assert more.polynomial == InputPolynomial(2, 1)
+    assert not more.rests_before_start
+
+
+def test_without_an_estimator_there_is_nothing_to_choose_an_order_by(tmp_path: Path) -> None:
+    """Fixed steps have order 1 and a thousandth of the time, unless told otherwise."""
+    settings = load_system(written(tmp_path, simulation('estimator = "none"'))).simulation
+    assert settings.polynomial == InputPolynomial(1, 0)
+    assert settings.step_size == pytest.approx(4e-3)
+    given = load_system(written(tmp_path, simulation('estimator = "none"\norder = 3'))).simulation
+    assert given.polynomial == InputPolynomial(3, 0)
 
 
 @given(
@@ -318,10 +374,20 @@ def test_unknown_keys_are_mistakes_everywhere(tmp_path: Path, text: str, words: 
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        ("order", "4", "0, 1, 2 or 3"),
-        ("order", "-1", "0, 1, 2 or 3"),
-        ("order", "true", "0, 1, 2 or 3"),
-        ("order", '"1"', "0, 1, 2 or 3"),
+        ("order", "4", "0, 1, 2, 3 or 'auto'"),
+        ("order", "-1", "0, 1, 2, 3 or 'auto'"),
+        ("order", "true", "whole number"),
+        ("order", '"1"', "0, 1, 2, 3 or 'auto'"),
+        ("derivative_points", "3", "0, 1 or 2"),
+        ("derivative_points", "true", "whole number"),
+        ("preset", '"papr"', "'paper'"),
+        ("constants", '"papers"', "'exact' or 'paper'"),
+        ("controller", '"p"', "'pi' or 'elementary'"),
+        ("sequence", '"gauss"', "'jacobi' or 'gauss-seidel'"),
+        ("evaluate_outputs", "1", ""),
+        ("discontinuities", '"no"', ""),
+        ("events", "1.0", "must be an array"),
+        ("output_interval", "0", "greater than 0"),
         ("estimator", '"richardson"', "'rich', 'mod' or 'none'"),
         ("initial_history", '"zero"', "'rest' or 'none'"),
         ("relative_tolerance", "-1e-4", "greater than or equal to 0"),
@@ -369,6 +435,20 @@ def test_wrong_values_are_named_with_what_is_allowed(
             "smallest_step_size = 0.1\nlargest_step_size = 0.01",
             "smallest_step_size 0.1 is above largest_step_size 0.01",
         ),
+        ("events = [4.0]", "the event at 4 is not between start and stop time"),
+        ("events = [1.0, 0.0]", "the event at 0 is not between start and stop time"),
+        (
+            "order = 2\nderivative_points = 2",
+            "a polynomial of order 2 cannot meet derivatives at 2 points",
+        ),
+        (
+            'constants = "paper"\nderivative_points = 1',
+            'constants = "paper" hold for values only: they need derivative_points = 0',
+        ),
+        (
+            'constants = "paper"\nsequence = "gauss-seidel"',
+            'constants = "paper" hold for sequence = "jacobi" only',
+        ),
     ],
 )
 def test_values_that_contradict_each_other(tmp_path: Path, lines: str, words: str) -> None:
@@ -394,6 +474,10 @@ def test_values_that_contradict_each_other(tmp_path: Path, lines: str, words: st
         ),
         ("[slaves.a]\nrelative_tolerance = -1", "[slaves.a] relative_tolerance = -1: "),
         ("[slaves.a]\nabsolute_tolerance = 0", "[slaves.a] absolute_tolerance = 0: "),
+        ("[slaves.a]\nstep_size = 0", "[slaves.a] step_size = 0: "),
+        ("[slaves.a]\nstep_multiple = -1", "[slaves.a] step_multiple = -1: "),
+        ("[slaves.a]\nlargest_step_size = 0", "[slaves.a] largest_step_size = 0: "),
+        ("[slaves.a]\noutputs_follow_inputs = 1", "[slaves.a] outputs_follow_inputs = 1: "),
         ("[slaves.a]\ntolerances = { x = 1 }", "[slaves.a.tolerances] x = 1: must be a table"),
         (
             "[slaves.a]\ntolerances = { x = { absolute = 0 } }",

@@ -1,10 +1,11 @@
-"""Laws of the error estimators, the error norm and the step size controller."""
+"""Laws of the error estimators' constants, the error norm and the step size controller."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from fractions import Fraction
+from itertools import accumulate
 
 import numpy as np
 import pytest
@@ -18,19 +19,32 @@ from master_node.numerics.error_estimators import (
     ESTIMATORS,
     Comparison,
     ErrorEstimator,
+    exact_ratio,
+    node_integral,
+    node_polynomial,
 )
-from master_node.numerics.extrapolation import CouplingHistory
+from master_node.numerics.extrapolation import (
+    POLYNOMIALS,
+    Extrapolation,
+    InputKind,
+    InputPolynomial,
+    Nodes,
+)
 from master_node.numerics.norms import first_not_finite, weighted_rms_norm
-from master_node.numerics.step_size_controller import StepSizeController, last_step_size
-from protocol.signals import MAX_ORDER, InputSignal
-from tests.quarter_car_case import CHASSIS, WHEEL, LinearSlave, exact_solution
+from master_node.numerics.step_size_controller import (
+    EXPONENTS,
+    ControllerMemory,
+    StepSizeController,
+    last_step_size,
+)
+from protocol.signals import MAX_ORDER
 
 ORDERS = range(MAX_ORDER + 1)
 
 # ---- The constants ------------------------------------------------------------------------------
 
 
-def error_integral(nodes: list[int], begin: int, end: int) -> Fraction:
+def error_integral(nodes: Nodes | list[int], begin: float, end: float) -> Fraction:
     """The integral of prod(s - node) from ``begin`` to ``end``, in exact fractions."""
     w = Polynomial.fromroots([Fraction(node) for node in nodes]).coef.tolist()
     return sum(
@@ -54,7 +68,7 @@ def test_ratio_of_rich_is_two_to_the_order(k: int) -> None:
     """One step of 2H through every second point errs 2^(k+1) times as much as two of H."""
     comparison = error_integral([-2 * i for i in range(k + 1)], 0, 2)
     assert comparison / two_small_steps(k) == 2 ** (k + 1)
-    assert EST_RICH.ratios[k] == 2 ** (k + 1)
+    assert EST_RICH.paper_ratios[k] == 2 ** (k + 1)
 
 
 @pytest.mark.parametrize(
@@ -65,120 +79,99 @@ def test_ratio_of_mod_is_that_of_the_paper(k: int, ratio: Fraction) -> None:
     """2, 14/5, 32/9 (the paper, section 2) and 1076/251, from the integrals themselves."""
     comparison = error_integral([-i for i in range(k + 1)], 0, 2)
     assert comparison / two_small_steps(k) == ratio
-    assert EST_MOD.ratios[k] == float(ratio)
+    assert EST_MOD.paper_ratios[k] == float(ratio)
 
 
-def test_each_output_has_the_ratio_of_its_slaves_order() -> None:
-    """``ratio`` looks p up for each output; slaves may have different orders."""
-    orders = np.array([0, 2, 1, 2])
-    assert EST_MOD.ratio(orders).tolist() == [2.0, 32 / 9, 14 / 5, 32 / 9]
-    assert EST_RICH.ratio(orders).tolist() == [2.0, 8.0, 4.0, 8.0]
+def nodes_of(
+    estimator: ErrorEstimator, polynomial: InputPolynomial, past: list[float], step_size: float
+) -> tuple[Nodes, Nodes, Nodes]:
+    """Nodes of both small steps and of the comparison solution, after some points."""
+    extrapolation = Extrapolation([InputKind(has_derivative=True)], np.zeros(1, dtype=np.intp))
 
+    def nodes(points: list[float]) -> Nodes:
+        found = extrapolation.nodes(points, (polynomial,), 0.0)
+        return found[0]
 
-@pytest.mark.parametrize("estimator", ESTIMATORS.values(), ids=lambda e: e.name)
-@pytest.mark.parametrize("k", ORDERS)
-def test_points_and_order_are_inverse(estimator: ErrorEstimator, k: int) -> None:
-    """Order k is used as soon as its points are there, and not one point earlier."""
-    points = estimator.points(k)
-    assert estimator.order(k, points) == k
-    assert estimator.order(k, 1000) == k
-    if k > 0:
-        assert estimator.order(k, points - 1) == k - 1
-    assert points == (2 * k + 1 if estimator.comparison is Comparison.LONG_STEP else k + 1)
-
-
-# ---- The estimate against the true error --------------------------------------------------------
-
-
-def coupled_inputs(time: float) -> tuple[np.ndarray, np.ndarray]:
-    """What the chassis and the wheel get from each other in the exact solution."""
-    state = exact_solution(time)[0]
-    return state[2:], state[:2]
-
-
-def one_double_step(
-    estimator: ErrorEstimator, k: int, time: float, step_size: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """EST and the true error of a double step from the exact solution with an exact history.
-
-    Subsystems are propagated exactly (matrix exponential), so that extrapolation is all the
-    error there is. Shape (4,) each: chassis.x, chassis.v, wheel.x, wheel.v.
-    """
-    start = exact_solution(time)[0]
-    states = [start[:2], start[2:]]
-    systems = [CHASSIS, WHEEL]
-    points = [time - i * step_size for i in range(2 * k + 1)]
-    history = CouplingHistory(
-        tuple(points), tuple(np.concatenate(coupled_inputs(t)) for t in points), len(points)
-    )
-
-    def step(x: list[np.ndarray], signal: InputSignal, h: float) -> list[np.ndarray]:
-        parts = (signal.derivatives[:, :2], signal.derivatives[:, 2:])
-        return [s.propagate(x_i, u, h) for s, x_i, u in zip(systems, x, parts, strict=True)]
-
-    signal = history.signal(k)
-    middle = step(states, signal, step_size)
-    inputs = np.concatenate([middle[1], middle[0]])
-    y = step(middle, history.pushed(time + step_size, inputs).signal(k), step_size)
-    if estimator.comparison is Comparison.LONG_STEP:
-        comparison = step(states, history.long_signal(k), 2 * step_size)
-    else:
-        comparison = step(middle, signal.shifted(step_size), step_size)
-    estimate = estimator.estimate(
-        np.concatenate(y), np.concatenate(comparison), estimator.ratio(np.full(4, k))
-    )
-    return estimate, np.concatenate(y) - exact_solution(time + 2 * step_size)[0]
+    first, second = nodes(past), nodes([step_size, *past])
+    comparison = nodes(past[::2]) if estimator is EST_RICH else first
+    return first, second, comparison
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS.values(), ids=lambda e: e.name)
 @pytest.mark.parametrize("k", ORDERS)
-@pytest.mark.parametrize("time", [0.05, 0.3])
-def test_the_estimate_tends_to_the_true_error(
-    estimator: ErrorEstimator, k: int, time: float
+@pytest.mark.parametrize("step_size", [1.0, 3e-4])
+def test_exact_ratio_on_an_equidistant_history(
+    estimator: ErrorEstimator, k: int, step_size: float
 ) -> None:
-    """Law: EST / true local error -> 1 as H -> 0, the deviation being of first order in H.
+    """The paper's constants without feed-through; with it k + 2 for EST_mod, 2^(k+1) for EST_Rich.
 
-    In the norm of all outputs. A single one may be slower where its leading term happens to be
-    small, and a displacement is one integration further from the inputs than a velocity, so its
-    error is one order smaller, with a constant of its own.
+    For values only, whatever the size of the steps.
     """
-    deviations = []
-    for step_size in (1e-3, 0.5e-3, 0.25e-3):
-        estimate, error = one_double_step(estimator, k, time, step_size)
-        deviations.append(np.linalg.norm(estimate - error) / np.linalg.norm(error))
-    assert np.linalg.norm(estimate) / np.linalg.norm(error) == pytest.approx(1.0, abs=0.025)
-    assert np.log2(deviations[-2] / deviations[-1]) == pytest.approx(1.0, abs=0.15)
-    assert 2.0 * deviations[-1] - deviations[-2] == pytest.approx(0.0, abs=0.01)
+    past = [-i * step_size for i in range(estimator.points(k + 1))]
+    nodes = nodes_of(estimator, InputPolynomial(k), past, step_size)
+    ends = (step_size, 2.0 * step_size)
+    ratio = exact_ratio(*nodes, *ends, feed_through=False)
+    assert ratio == pytest.approx(estimator.paper_ratios[k], rel=1e-13)
+    direct = exact_ratio(*nodes, *ends, feed_through=True)
+    assert direct == pytest.approx(k + 2 if estimator is EST_MOD else 2 ** (k + 1), rel=1e-13)
+
+
+@given(
+    st.sampled_from(list(ESTIMATORS.values())),
+    st.sampled_from(POLYNOMIALS),
+    st.lists(st.floats(0.1, 5.0), min_size=7, max_size=7),
+    st.floats(0.2, 3.0),
+)
+def test_exact_ratio_is_that_of_the_integrals(
+    estimator: ErrorEstimator, polynomial: InputPolynomial, steps: list[float], step_size: float
+) -> None:
+    """Against the same integrals in exact fractions, on any history, with and without derivatives.
+
+    The comparison solution always errs more than the two small steps, so EST has a meaning.
+    """
+    past = [0.0, *(-s for s in accumulate(steps))]
+    first, second, comparison = nodes_of(estimator, polynomial, past, step_size)
+    end = 2.0 * step_size
+    small = error_integral(first, 0.0, step_size) + error_integral(second, step_size, end)
+    expected = float(error_integral(comparison, 0.0, end) / small)
+    ratio = exact_ratio(first, second, comparison, step_size, end, feed_through=False)
+    assert ratio == pytest.approx(expected, rel=1e-9)
+    assert ratio > 1.05
+    direct = exact_ratio(first, second, comparison, step_size, end, feed_through=True)
+    products = [math.prod(end - s for s in nodes) for nodes in (comparison, second)]
+    assert direct == pytest.approx(products[0] / products[1], rel=1e-9)
+    assert direct > 1.05
+
+
+@given(
+    st.lists(st.floats(-3.0, 3.0), min_size=1, max_size=5),
+    st.floats(-3.0, 3.0),
+    st.floats(-3.0, 3.0),
+)
+def test_node_integral_is_exact(nodes: list[float], begin: float, end: float) -> None:
+    """Up to rounding, for as many nodes as a polynomial has and one more."""
+    found = node_integral(tuple(nodes), begin, end)
+    expected = float(error_integral(tuple(nodes), begin, end))
+    size = abs(end - begin) * 6.0 ** len(nodes)
+    assert found == pytest.approx(expected, rel=0.0, abs=1e-14 * size)
+    assert node_polynomial(tuple(nodes), begin) == math.prod(begin - s for s in nodes)
+
+
+def test_an_estimate_has_one_constant_or_one_for_each_output() -> None:
+    """(y - y~) / (1 - p), element by element."""
+    y, other = np.array([1.0, 2.0]), np.array([0.5, 3.0])
+    assert EST_MOD.estimate(y, other, 2.0).tolist() == [-0.5, 1.0]
+    assert EST_MOD.estimate(y, other, np.array([2.0, 5.0])).tolist() == [-0.5, 0.25]
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS.values(), ids=lambda e: e.name)
-@pytest.mark.parametrize("k", ORDERS)
-def test_the_local_error_has_order_k_plus_2(estimator: ErrorEstimator, k: int) -> None:
-    """Without feed-through the error of a double step, and so EST, is O(H^(k+2)): P = k + 2."""
-    sizes = (0.5e-3, 0.25e-3)
-    norms = np.array(
-        [[np.linalg.norm(v) for v in one_double_step(estimator, k, 0.3, h)] for h in sizes]
-    )
-    observed = np.log2(norms[0] / norms[1])
-    assert observed.tolist() == pytest.approx([k + 2, k + 2], abs=0.1)
-
-
-def test_the_propagation_is_exact() -> None:
-    """What the two tests above stand on: with the exact inputs' Taylor series there is no error."""
-    t, h = 0.3, 1e-3
-    x = exact_solution(t)[0]
-    jacobian = (exact_solution(t + 1e-7)[0] - exact_solution(t - 1e-7)[0]) / 2e-7
-    u = np.array([x[2:], jacobian[2:]])
-    reached = CHASSIS.propagate(x[:2], u, h)
-    assert reached == pytest.approx(exact_solution(t + h)[0][:2], rel=0.0, abs=1e-6)
-    whole = CHASSIS.propagate(CHASSIS.propagate(x[:2], u, h / 2), shifted(u, h / 2), h / 2)
-    assert whole == pytest.approx(reached, rel=1e-13)
-    assert isinstance(CHASSIS.slave(x[:2]), LinearSlave)
-
-
-def shifted(u: np.ndarray, offset: float) -> np.ndarray:
-    """The same polynomial around another point."""
-    return InputSignal(u).shifted(offset).derivatives
+@pytest.mark.parametrize("points", range(1, 6))
+def test_points_and_available_are_inverse(estimator: ErrorEstimator, points: int) -> None:
+    """A polynomial is used as soon as its points are there, and not one point earlier."""
+    depth = estimator.points(points)
+    assert estimator.available(depth) == points
+    assert estimator.available(depth - 1) == points - 1
+    assert depth == (2 * points - 1 if estimator.comparison is Comparison.LONG_STEP else points)
 
 
 # ---- ERR ----------------------------------------------------------------------------------------
@@ -245,14 +238,18 @@ def test_norm_of_errors_that_overflow_is_infinite() -> None:
 
 @given(st.lists(finite, max_size=8), st.data())
 def test_first_not_finite(y: list[float], data: st.DataObject) -> None:
-    """None for numbers, however large; else the first index where there is none."""
+    """None for numbers, however large; else the first index where there is none.
+
+    In any row: derivatives count as much as values.
+    """
     values = np.array(y)
-    assert first_not_finite(values) is None
+    assert first_not_finite(values[np.newaxis]) is None
     if y:
         index = data.draw(st.integers(0, len(y) - 1))
         values[index] = data.draw(st.sampled_from([math.nan, math.inf, -math.inf]))
         values[index + 1 :] = math.nan
-        assert first_not_finite(values) == index
+        assert first_not_finite(values[np.newaxis]) == index
+        assert first_not_finite(np.array([np.zeros(len(y)), values])) == index
 
 
 # ---- The controller -----------------------------------------------------------------------------
@@ -265,7 +262,7 @@ CONTROLLER = StepSizeController(
 @given(st.floats(1e-6, 1.0), st.floats(1e-10, 1e10), st.integers(1, 5))
 def test_controller_is_the_papers_formula(step_size: float, error: float, p: int) -> None:
     """H min(theta_max, max(theta_min, alpha ERR^(-1/P))), accepted exactly when ERR <= 1."""
-    accepted, following = CONTROLLER.decide(step_size, error, p)
+    accepted, following, _ = CONTROLLER.decide(step_size, error, p)
     assert accepted == (error <= 1.0)
     expected = step_size * min(2.0, max(0.3, 0.85 * error ** (-1.0 / p)))
     assert following == pytest.approx(expected, rel=1e-14)
@@ -283,12 +280,15 @@ def test_controller_never_accepts_what_is_no_number(error: float) -> None:
 
 def test_an_error_of_exactly_one_is_accepted() -> None:
     """ERR <= 1, not ERR < 1; the step gets smaller all the same, by alpha."""
-    assert CONTROLLER.decide(1e-3, 1.0, 2) == (True, pytest.approx(0.85e-3))
+    accepted, following, _ = CONTROLLER.decide(1e-3, 1.0, 2)
+    assert (accepted, following) == (True, pytest.approx(0.85e-3))
 
 
 def test_an_error_of_zero_is_the_largest_growth() -> None:
     """A system at rest: no division by zero."""
-    assert CONTROLLER.decide(1e-3, 0.0, 2) == (True, 2e-3)
+    assert CONTROLLER.decide(1e-3, 0.0, 2)[:2] == (True, 2e-3)
+    assert PI.decide(1e-3, 0.0, 2, ControllerMemory(0.5))[:2] == (True, 2e-3)
+    assert PI.decide(1e-3, 0.5, 2, ControllerMemory(0.0)).step_size <= 2e-3
 
 
 @given(
@@ -316,6 +316,79 @@ def test_after_a_discard_the_step_goes_not_beyond_what_was_reached(
 def test_a_slave_that_does_not_tell_how_far_it_got_gets_the_largest_reduction() -> None:
     """FMI 2 lets a slave discard without a last successful time."""
     assert CONTROLLER.after_discard(1e-3, math.nan) == pytest.approx(0.3e-3)
+
+
+# ---- The PI controller --------------------------------------------------------------------------
+
+
+def pi_controller(**bounds: float) -> StepSizeController:
+    """The controller that a run has by default."""
+    wide = {"smallest_step_size": 1e-9, "largest_step_size": 1e3, **bounds}
+    present, past = EXPONENTS["pi"]
+    return StepSizeController(
+        0.85, 0.3, 2.0, **wide, present=present, past=past, grows_after_rejection=False
+    )
+
+
+PI = pi_controller()
+errors = st.floats(1e-8, 1.0)
+
+
+@given(st.floats(1e-6, 1.0), errors, st.integers(1, 5))
+def test_without_a_past_the_pi_controller_is_the_elementary_one(
+    step_size: float, error: float, p: int
+) -> None:
+    """There is nothing to compare the first error with."""
+    first = PI.decide(step_size, error, p)
+    assert first.step_size == CONTROLLER.decide(step_size, error, p).step_size
+    assert first.memory == ControllerMemory(error)
+
+
+@given(st.floats(1.001, 1e10), errors, st.booleans(), st.integers(1, 5))
+def test_a_rejection_is_answered_as_the_elementary_controller_does(
+    error: float, before: float, rejected: bool, p: int
+) -> None:
+    """Whatever was before; and the error of the step accepted before is remembered."""
+    decision = PI.decide(1e-3, error, p, ControllerMemory(before, rejected))
+    assert decision.step_size == CONTROLLER.decide(1e-3, error, p).step_size
+    assert not decision.accepted
+    assert decision.memory == ControllerMemory(before, rejected=True)
+
+
+@given(errors, errors, st.integers(1, 5))
+def test_after_a_rejection_there_is_no_growth(error: float, before: float, p: int) -> None:
+    """A step that had to be repeated says that larger ones are too large."""
+    decision = PI.decide(1e-3, error, p, ControllerMemory(before, rejected=True))
+    assert decision.accepted
+    assert decision.step_size <= 1e-3
+    assert not decision.memory.rejected
+    elementary = CONTROLLER.decide(1e-3, 1e-6, p, ControllerMemory(before, rejected=True))
+    assert elementary.step_size > 1e-3
+
+
+@given(st.floats(1e-3, 1e3), st.integers(1, 5))
+def test_both_controllers_have_the_same_steady_state(constant: float, p: int) -> None:
+    """Law: where ERR = (c H)^P both settle at the H with ERR = alpha^P."""
+    settled = []
+    for controller in (CONTROLLER, PI):
+        step_size, memory = 0.5 / constant, ControllerMemory()
+        for _ in range(200):
+            _, step_size, memory = controller.decide(
+                step_size, (constant * step_size) ** p, p, memory
+            )
+        settled.append(step_size)
+    assert settled == pytest.approx([0.85 / constant] * 2, rel=1e-6)
+
+
+@given(errors, errors, st.integers(1, 5), st.booleans())
+def test_the_pi_controller_stays_within_its_bounds(
+    error: float, before: float, p: int, rejected: bool
+) -> None:
+    """Both of the change and of H itself."""
+    bounds = pi_controller(smallest_step_size=5e-4, largest_step_size=1.5e-3)
+    memory = ControllerMemory(before, rejected)
+    assert 0.3e-3 <= PI.decide(1e-3, error, p, memory).step_size <= 2e-3
+    assert 5e-4 <= bounds.decide(1e-3, error, p, memory).step_size <= 1.5e-3
 
 
 # ---- The end of the run -------------------------------------------------------------------------

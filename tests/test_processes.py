@@ -660,7 +660,9 @@ def test_an_output_directory_that_cannot_be_written(start: Start, tmp_path: Path
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--order", "4"], "--order"),
+        (["--order", "4"], "order = 4: input should be 0, 1, 2, 3 or 'auto'"),
+        (["--preset", "papers"], "preset = 'papers'"),
+        (["--sequence", "gauss"], "'jacobi' or 'gauss-seidel'"),
         (["--step-size", "0"], "initial_step_size = 0.0"),
         (["--stop-time", "-1"], "stop_time -1 must be after start_time 0"),
         (["--relative-tolerance", "-1"], "relative_tolerance = -1.0"),

@@ -19,7 +19,17 @@ from master_node.results import summarize
 START = RunStart(("s.x",), ("m",), 1.0, 5.0, np.zeros(1))
 END = RunEnd(
     Outcome.COMPLETED,
-    Statistics(6, 1, 9, 0.25, 1.5, 5.0, 0.5, 1.0, {"s[1]": SlaveStatistics(10, 2, 6, 0.75)}),
+    Statistics(
+        communication_steps=6,
+        rejected_double_steps=1,
+        round_trips=9,
+        wait_time=0.25,
+        wall_time=1.5,
+        time=5.0,
+        smallest_step_size=0.5,
+        largest_step_size=1.0,
+        slaves={"s[1]": SlaveStatistics(10, 2, 6, 0.75)},
+    ),
 )
 
 
@@ -30,7 +40,7 @@ def drive(bar: ProgressBar, attempts: int = 4) -> None:
         time = 1.0 + 4.0 * i / attempts
         accepted = i % 4 != 1
         points = ((time + 1.0 / attempts, np.zeros(1)),) if accepted else ()
-        bar.attempted(Attempt(time, 0.5, 2, 0.3, accepted, "s.x", points))
+        bar.attempted(Attempt(time, 0.5, 3, 2, 0.3, accepted, "s.x", points))
     bar.ended(END)
 
 
@@ -53,12 +63,12 @@ def test_quiet_prints_nothing(terminal: bool) -> None:
 
 
 def test_at_a_terminal_a_bar_with_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Time, H, order, rejections are shown, the cursor comes back, the last state stays."""
+    """Time, H, polynomial, rejections are shown, the cursor comes back, the last state stays."""
     monkeypatch.setattr(progress_module, "UPDATE_INTERVAL", 0.0)
     out = io.StringIO()
     drive(ProgressBar(console=Console(file=out, force_terminal=True, width=120)))
     text = out.getvalue()
-    for part in ("H = 5.00e-01 s", "k = 2", "1 rejected", "t = 5 s  completed", "100%", "left"):
+    for part in ("H = 5.00e-01 s", "k = 3''  ", "1 rejected", "t = 5 s  completed", "100%", "left"):
         assert part in text
     assert text.rstrip().endswith("\x1b[?25h"), "the cursor is visible again"
 
@@ -78,7 +88,7 @@ def test_redraws_are_rare_however_many_attempts(monkeypatch: pytest.MonkeyPatch)
     bar.started(START)
     for i in range(10_000):
         now = i * 1e-3  # ten seconds
-        bar.attempted(Attempt(now, 0.5, 2, 0.3, False, "s.x"))
+        bar.attempted(Attempt(now, 0.5, 2, 0, 0.3, False, "s.x"))
     assert 90 <= redraws <= 100
     bar.ended(END)
 

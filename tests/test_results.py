@@ -51,12 +51,12 @@ def start() -> RunStart:
 def accepted(time: float, step_size: float, limiting: str = "wheel.v") -> Attempt:
     """A double step to two new points."""
     points = tuple((t, outputs(t)) for t in (time + step_size, time + 2 * step_size))
-    return Attempt(time, step_size, 2, 0.25, True, limiting, points)
+    return Attempt(time, step_size, 3, 1, 0.25, True, limiting, points)
 
 
 def rejected(time: float, step_size: float, error_norm: float = 7.5) -> Attempt:
     """An attempt that reached nothing."""
-    return Attempt(time, step_size, 2, error_norm, False, "chassis.x")
+    return Attempt(time, step_size, 3, 1, error_norm, False, "chassis.x")
 
 
 def end(time: float = 1.0, outcome: Outcome = Outcome.COMPLETED, message: str = "") -> RunEnd:
@@ -67,7 +67,19 @@ def end(time: float = 1.0, outcome: Outcome = Outcome.COMPLETED, message: str = 
     }
     return RunEnd(
         outcome,
-        Statistics(4, 1, 10, 0.5, 2.0, time, 0.125, 0.25, slaves),
+        Statistics(
+            communication_steps=4,
+            rejected_double_steps=1,
+            discontinuities=3,
+            double_steps_at_discontinuities=7,
+            round_trips=10,
+            wait_time=0.5,
+            wall_time=2.0,
+            time=time,
+            smallest_step_size=0.125,
+            largest_step_size=0.25,
+            slaves=slaves,
+        ),
         message,
     )
 
@@ -130,10 +142,10 @@ def test_rejected_attempts_are_steps_but_no_results(tmp_path: Path) -> None:
     """A rejected attempt leaves a line in steps.csv and no trace in results.csv."""
     write(tmp_path)
     assert (tmp_path / "steps.csv").read_text().splitlines() == [
-        "time,step_size,order,error_norm,accepted,limiting_variable",
-        "0.0,0.5,2,7.5,false,chassis.x",
-        "0.0,0.25,2,0.25,true,wheel.v",
-        "0.5,0.125,2,0.25,true,wheel.v",
+        "time,step_size,order,derivative_points,error_norm,accepted,limiting_variable",
+        "0.0,0.5,3,1,7.5,false,chassis.x",
+        "0.0,0.25,3,1,0.25,true,wheel.v",
+        "0.5,0.125,3,1,0.25,true,wheel.v",
     ]
     without = write(tmp_path / "without", [a for a in ATTEMPTS if a.accepted])
     assert (tmp_path / "results.csv").read_bytes() == (without / "results.csv").read_bytes()
@@ -146,6 +158,7 @@ def test_equal_numbers_give_equal_bytes(tmp_path: Path) -> None:
             np.float64(a.time),
             np.float64(a.step_size),
             a.order,
+            a.derivative_points,
             np.float64(a.error_norm),
             a.accepted,
             a.limiting_variable,
@@ -167,7 +180,7 @@ def test_numbers_come_back_bit_for_bit(
     A NaN comes back as a NaN; its payload has no text.
     """
     points = tuple((float(i), np.array(row)) for i, row in enumerate(rows, 1))
-    attempt = Attempt(rows[0][0], rows[0][1], 1, rows[0][2], True, "", points)
+    attempt = Attempt(rows[0][0], rows[0][1], 1, 0, rows[0][2], True, "", points)
     result = Result.load(write(tmp_path_factory.mktemp("bits"), [attempt]))
     expected = np.array(rows)
     number = ~np.isnan(expected)
@@ -185,7 +198,7 @@ def test_any_text_stays_one_field_on_one_line(tmp_path: Path, text: str) -> None
     """Names and reasons with commas, quotes or line breaks do not break the tables."""
     writer = ResultsWriter(tmp_path, {})
     writer.started(RunStart((f"s.{text}", "s.z"), ("", ""), 0.0, 1.0, np.zeros(2)))
-    writer.attempted(Attempt(0.0, 0.1, 0, math.nan, False, text))
+    writer.attempted(Attempt(0.0, 0.1, 0, 0, math.nan, False, text))
     writer.ended(end())
     one_line = text.replace("\r", " ").replace("\n", " ")
     result = Result.load(tmp_path)
@@ -198,7 +211,7 @@ def test_a_system_without_outputs_has_a_time_column_only(tmp_path: Path) -> None
     """No outputs, m = 0, is a valid number of outputs."""
     writer = ResultsWriter(tmp_path, {})
     writer.started(RunStart((), (), 0.0, 1.0, np.zeros(0)))
-    writer.attempted(Attempt(0.0, 0.5, 0, math.nan, True, "", ((0.5, np.zeros(0)),)))
+    writer.attempted(Attempt(0.0, 0.5, 0, 0, math.nan, True, "", ((0.5, np.zeros(0)),)))
     writer.ended(end())
     assert (tmp_path / "results.csv").read_text() == "time\n0.0\n0.5\n"
     result = Result.load(tmp_path)
@@ -217,6 +230,8 @@ def test_summary_says_what_happened(tmp_path: Path) -> None:
         "message": "",
         "communication_steps": 4,
         "rejected_double_steps": 1,
+        "discontinuities": 3,
+        "double_steps_at_discontinuities": 7,
         "do_steps": {"wheel": 9, "chassis": 9},
         "rollbacks": {"wheel": 1, "chassis": 2},
         "requests": {"wheel": 5, "chassis": 6},
@@ -276,7 +291,7 @@ def test_memory_does_not_grow_with_the_run(tmp_path: Path, monkeypatch: pytest.M
     try:
         for i in range(100_000):
             text = "wheel.v" if i % 2 else reason.format(i)
-            writer.attempted(Attempt(0.5, 0.1, 2, 0.5, True, text, attempt.points))
+            writer.attempted(Attempt(0.5, 0.1, 2, 0, 0.5, True, text, attempt.points))
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -549,7 +564,7 @@ def put(directory: Path, lines: Sequence[str], name: str = "results.csv") -> Pat
 def test_unfinished_last_line_is_left_out(tmp_path: Path) -> None:
     """Without its line break a last number may be cut: 0.12 of 0.125 is no result."""
     put(tmp_path, ["time,a.x", "0.0,1.0", "0.5,0.12"])
-    put(tmp_path, [",".join(results_module.STEPS_DTYPE.names), "0.0,0.5,1,0.1,tr"], "steps.csv")
+    put(tmp_path, [",".join(results_module.STEPS_DTYPE.names), "0.0,0.5,1,0,0.1,tr"], "steps.csv")
     result = Result.load(tmp_path)
     assert result.time.tolist() == [0.0]
     assert len(result.steps) == 0
@@ -588,7 +603,7 @@ def test_malformed_results_name_file_and_line(
     ("name", "lines", "message"),
     [
         ("steps.csv", ["time,H", ""], r"steps\.csv, line 1: the columns must be time,step_size"),
-        ("steps.csv", [None, "0.0,0.1,1,0.5,maybe,x", ""], r"steps\.csv, line 2: .*maybe"),
+        ("steps.csv", [None, "0.0,0.1,1,0,0.5,maybe,x", ""], r"steps\.csv, line 2: .*maybe"),
         ("steps.csv", [None, "0.0,0.1", ""], r"steps\.csv, line 2: expected an attempted step"),
         ("summary.json", ["{", '"a": nope', "}"], r"summary\.json, line 2: Expecting value"),
         ("summary.json", ["[]"], r"summary\.json, line 1: expected a JSON object"),

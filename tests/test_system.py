@@ -78,8 +78,8 @@ def test_indices_of_the_quarter_car(tmp_path: Any) -> None:
     assert (chassis.output_slice, wheel.output_slice) == (slice(0, 2), slice(2, 4))
     assert coupled.source.tolist() == [2, 3, 0, 1]
     assert coupled.output_slave.tolist() == [0, 0, 1, 1]
-    assert not coupled.has_feed_through
-    assert coupled.loop == ()
+    assert not coupled.feed_through.any()
+    assert coupled.initialization.loop == ()
 
 
 @given(st.data())
@@ -189,11 +189,11 @@ def test_feed_through_counts_for_connected_inputs_only() -> None:
     """P = k + 1 only where an output contains an input that is extrapolated."""
     spring = described("x v", "F", feed_through={"F": ("x", "v")})
     descriptions = {"a": described("", "y"), "spring": spring}
-    assert not resolved(descriptions).has_feed_through
-    assert resolved(descriptions, ("a.y", "spring.v")).has_feed_through
+    assert not resolved(descriptions).feed_through.any()
+    assert resolved(descriptions, ("a.y", "spring.v")).feed_through.any()
     unrelated = described("x v", "F", feed_through={"F": ("x",)})
     coupled = resolved({"a": described("", "y"), "spring": unrelated}, ("a.y", "spring.v"))
-    assert not coupled.has_feed_through
+    assert not coupled.feed_through.any()
 
 
 def test_levels_follow_the_feed_through_across_slaves() -> None:
@@ -205,9 +205,9 @@ def test_levels_follow_the_feed_through_across_slaves() -> None:
         "middle": described("u", "y z", **gain),
     }
     coupled = resolved(descriptions, ("first.y", "middle.u"), ("middle.y", "last.u"))
-    levels = dict(zip(coupled.output_names, coupled.initial_levels.tolist(), strict=True))
+    levels = dict(zip(coupled.output_names, coupled.initialization.levels.tolist(), strict=True))
     assert levels == {"first.y": 0, "middle.z": 0, "middle.y": 1, "last.y": 2}
-    assert coupled.loop == ()
+    assert coupled.initialization.loop == ()
 
 
 @given(st.data())
@@ -223,7 +223,7 @@ def test_levels_are_consistent_in_any_system_without_a_loop(data: st.DataObject)
         (f"s{data.draw(st.integers(0, n - 1))}.y", f"s{i}.w") for i in range(n)
     ]
     coupled = resolved(descriptions, *connections)
-    levels = dict(zip(coupled.output_names, coupled.initial_levels.tolist(), strict=True))
+    levels = dict(zip(coupled.output_names, coupled.initialization.levels.tolist(), strict=True))
     feeding = {target: source for source, target in connections}
     for i in range(n):
         contains = descriptions[f"s{i}"].feed_through["y"] and feeding.get(f"s{i}.u")
@@ -234,25 +234,25 @@ def test_an_algebraic_loop_is_named() -> None:
     """A loop across slaves in initialization mode is found, and told along its connections."""
     gain = described("u", "y", feed_through={"y": ("u",)})
     coupled = resolved({"a": gain, "b": gain, "c": gain}, ("a.y", "b.u"), ("b.y", "a.u"))
-    assert coupled.initial_levels.size == 0
-    assert len(coupled.loop) == 3
-    assert set(coupled.loop) == {"a.y", "b.y"}
-    assert coupled.loop[0] == coupled.loop[-1]
+    assert coupled.initialization.levels.size == 0
+    assert len(coupled.initialization.loop) == 3
+    assert set(coupled.initialization.loop) == {"a.y", "b.y"}
+    assert coupled.initialization.loop[0] == coupled.initialization.loop[-1]
 
 
 def test_a_loop_only_in_initialization_mode_is_one_there_only() -> None:
     """ModelStructure tells the two modes apart, and so do we."""
     gain = described("u", "y", initial={"y": ("u",)})
     coupled = resolved({"a": gain, "b": gain}, ("a.y", "b.u"), ("b.y", "a.u"))
-    assert coupled.loop
-    assert not coupled.has_feed_through
+    assert coupled.initialization.loop
+    assert not coupled.feed_through.any()
 
 
 def test_a_cycle_of_connections_without_feed_through_is_no_loop() -> None:
     """The quarter car's displacements: each slave feeds the other, nothing is implicit."""
     coupled = resolved(TWO, ("a.y", "b.u"), ("b.y", "a.u"))
-    assert coupled.loop == ()
-    assert coupled.initial_levels.tolist() == [0, 0, 0]
+    assert coupled.initialization.loop == ()
+    assert coupled.initialization.levels.tolist() == [0, 0, 0]
     assert np.issubdtype(coupled.source.dtype, np.integer)
 
 

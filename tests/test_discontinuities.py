@@ -1,0 +1,220 @@
+"""Jumps of the coupled variables are found, stepped up to, and not stepped over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from master_node import Result, System, load_system, simulate
+from master_node.numerics.discontinuities import (
+    NO_JUMP,
+    Bracket,
+    Defects,
+    does_not_shrink,
+    has_jumped_unnoticed,
+    step_within,
+)
+from master_node.numerics.double_step_times import DoubleStepTimes
+from protocol.errors import ConfigurationError
+from tests.quarter_car_case import EXAMPLES
+
+OSCILLATORS = EXAMPLES.parent / "oscillators"
+SMALLEST = 1e-8  # 1e-9 of the ten simulated seconds
+
+
+def kick(oscillator_dir: Path, t_step: float = 1.0, **simulation: Any) -> Result:
+    """Two masses of which the first one's wall jumps at ``t_step`` [s]."""
+    system = load_system(OSCILLATORS / "kick.toml")
+    slaves = {
+        name: slave.model_dump(exclude_unset=True)
+        | {"model": str(oscillator_dir / (slave.model or ""))}
+        for name, slave in system.slaves.items()
+    }
+    slaves["source"]["parameters"] = {**slaves["source"]["parameters"], "t_step": t_step}
+    whole = System(simulation=system.simulation, slaves=slaves, connections=system.connections)
+    return simulate(whole, in_process=True, **simulation)
+
+
+def largest_error(oscillators: ModuleType, result: Result, t_step: float = 1.0) -> float:
+    """Of all outputs but the source's, at all points."""
+    names = [name for name in result.names if not name.startswith("source")]
+    values = {"source.t_step": t_step}
+    exact = oscillators.reference_solution("kick", names, result.time, values=values)
+    y = np.column_stack([result[name] for name in names])
+    return float(np.abs(y - exact).max())
+
+
+def crossings(result: Result) -> np.ndarray:
+    """The accepted attempts that lead over a jump."""
+    steps = result.steps
+    jumps = np.array(["jumps" in name for name in steps["limiting_variable"]], dtype=bool)
+    found: np.ndarray = steps[jumps & steps["accepted"]]
+    return found
+
+
+@pytest.mark.parametrize("estimator", ["mod", "rich"])
+@pytest.mark.parametrize("order", [0, 1, 2, 3, "auto"])
+def test_a_jump_is_localised_to_the_smallest_step(
+    oscillator_dir: Path, oscillators: ModuleType, estimator: str, order: int | str
+) -> None:
+    """Law: one crossing, of the smallest H, with the jump inside; every other step is beside it.
+
+    The source's own output jumps between two neighbouring communication points that are no
+    farther apart than that, and the masses are as good as without a jump.
+    """
+    result = kick(oscillator_dir, estimator=estimator, order=order)
+    (crossing,) = crossings(result)
+    assert crossing["limiting_variable"] == "source.y jumps"
+    assert crossing["step_size"] == SMALLEST
+    assert crossing["time"] < 1.0 <= crossing["time"] + 2.0 * SMALLEST * (1 + 1e-6)
+    jump = int(np.flatnonzero(np.diff(result["source.y"]))[0])
+    assert result.time[jump + 1] - result.time[jump] <= SMALLEST * (1 + 1e-6)
+    assert result.summary["discontinuities"] == 1
+    assert result.summary["double_steps_at_discontinuities"] <= 60
+    assert largest_error(oscillators, result) < (2e-2 if order in {0, 1} else 6e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(t_step=st.floats(0.05, 9.0))
+def test_a_jump_is_found_wherever_it_is(
+    oscillator_dir: Path, oscillators: ModuleType, t_step: float
+) -> None:
+    """Law: at any time, inside the first or the second small step, one jump is found."""
+    result = kick(oscillator_dir, t_step)
+    (crossing,) = crossings(result)
+    assert crossing["time"] < t_step <= crossing["time"] + 2.0 * SMALLEST * (1 + 1e-6)
+    assert result.summary["discontinuities"] == 1
+    assert largest_error(oscillators, result, t_step) < 6e-3
+
+
+def test_behind_a_jump_the_order_restarts(oscillator_dir: Path) -> None:
+    """The history is cut: the polynomials behind the jump begin with one point."""
+    result = kick(oscillator_dir)
+    steps = result.steps
+    behind = steps[steps["time"] > 1.0]
+    assert behind["order"][0] == 1
+    assert behind["derivative_points"][0] == 1
+    assert behind["order"].max() == 3
+    values_only = kick(oscillator_dir, derivative_points=0).steps
+    assert values_only[values_only["time"] > 1.0]["order"][0] == 0
+
+
+def test_a_declared_event_is_a_communication_point(
+    oscillator_dir: Path, oscillators: ModuleType
+) -> None:
+    """``events``: the time itself is a point, one crossing and no search is spent on it."""
+    result = kick(oscillator_dir, events=(1.0, 2.5))
+    assert {1.0, 2.5} <= set(result.time.tolist())
+    steps = result.steps
+    assert (steps["limiting_variable"] == "event").sum() == 2
+    assert result.summary["discontinuities"] == 2
+    assert result.summary["double_steps_at_discontinuities"] == 2
+    assert largest_error(oscillators, result) < 6e-3
+
+
+def test_without_the_search_a_jump_is_stepped_over(
+    oscillator_dir: Path, oscillators: ModuleType
+) -> None:
+    """What the search is for: the estimates see nothing of a jump in the second small step."""
+    result = kick(oscillator_dir, discontinuities=False)
+    assert result.summary["discontinuities"] == 0
+    found = largest_error(oscillators, kick(oscillator_dir))
+    assert largest_error(oscillators, result) > 5.0 * found
+
+
+def test_tighter_tolerances_give_smaller_errors_beside_a_jump(
+    oscillator_dir: Path, oscillators: ModuleType
+) -> None:
+    """A jump does not spoil the proportion of error and tolerance."""
+    errors = [
+        largest_error(
+            oscillators,
+            kick(oscillator_dir, relative_tolerance=tol, absolute_tolerance=tol),
+        )
+        / tol
+        for tol in (1e-4, 1e-5, 1e-6)
+    ]
+    assert max(errors) / min(errors) < 10.0
+
+
+@pytest.mark.parametrize("name", ["two_mass", "chain", "van_der_pol"])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-4, 1e-6])
+def test_smooth_systems_give_no_alarm(oscillator_dir: Path, name: str, tolerance: float) -> None:
+    """No crossing, and no double step spent on a search, where nothing jumps."""
+    system = load_system(OSCILLATORS / f"{name}.toml")
+    result = simulate(
+        system, in_process=True, relative_tolerance=tolerance, absolute_tolerance=tolerance
+    )
+    assert result.summary["discontinuities"] == 0
+    assert result.summary["double_steps_at_discontinuities"] == 0
+
+
+def test_events_need_room() -> None:
+    """An event at an end of the simulated time, or two at once, is an error before the start."""
+    system = load_system(OSCILLATORS / "kick.toml")
+    for events in ((1.0, 1.0 + 1e-9), (1e-9,)):
+        with pytest.raises(ConfigurationError, match="too near to another event"):
+            simulate(system, in_process=True, events=events)
+    with pytest.raises(ConfigurationError, match="is not between start and stop time"):
+        simulate(system, in_process=True, events=(11.0,))
+    with pytest.raises(ConfigurationError, match="events need an estimator"):
+        simulate(system, in_process=True, events=(1.0,), estimator="none")
+
+
+# ---- The parts ----------------------------------------------------------------------------------
+
+
+def defects(middle: float, end: float, expected: float = 0.0, change: float = 0.0) -> Defects:
+    """Of some double step."""
+    return Defects(middle, end, expected, change, 0)
+
+
+def test_what_is_like_a_jump() -> None:
+    """A defect above the tolerance that is more than a part of what was foreseen."""
+    assert defects(0.0, 2.0).is_like_a_jump
+    assert not defects(0.0, 0.9).is_like_a_jump
+    assert not defects(0.0, 2.0, change=10.0).is_like_a_jump
+    assert not defects(np.nan, np.nan).is_like_a_jump
+
+
+def test_a_surprise_in_the_second_step_is_a_jump_nobody_noticed() -> None:
+    """Ten times what was expected and twice the change foreseen; never one of the first step."""
+    assert has_jumped_unnoticed(defects(0.0, 5.0))
+    assert not has_jumped_unnoticed(defects(0.0, 5.0, expected=0.6))
+    assert not has_jumped_unnoticed(defects(0.0, 5.0, change=3.0))
+    assert not has_jumped_unnoticed(defects(6.0, 5.0))
+
+
+def test_a_defect_that_stays_while_the_step_shrinks() -> None:
+    """Only a much smaller step says something; a smooth defect is gone by then."""
+    bracket = Bracket(rejected=(1.0, 8.0))
+    assert does_not_shrink(bracket, 0.2, defects(7.0, 0.0))
+    assert not does_not_shrink(bracket, 0.5, defects(7.0, 0.0))
+    assert not does_not_shrink(bracket, 0.2, defects(3.0, 0.0))
+    assert not does_not_shrink(NO_JUMP, 0.2, defects(7.0, 0.0))
+
+
+@given(st.floats(0.0, 1.0), st.floats(1e-6, 1.0))
+def test_the_search_halves_the_bracket(jump: float, size: float) -> None:
+    """Law: with exact knowledge of where a jump shows, the bracket shrinks to the smallest H."""
+    time, smallest = 0.0, 1e-9
+    bracket = Bracket(size, (size / 2.0, 1.0), confirmed=True, size=1.0)
+    place = max(jump * size, 2e-9)
+    for _ in range(200):
+        h = step_within(bracket, time, size, smallest)
+        if h <= smallest:
+            break
+        times = DoubleStepTimes.from_step_size(time, h)
+        if place <= times.end:
+            in_first = place <= times.middle
+            bracket = bracket.after_rejection(times, defects(float(in_first), 1.0))
+        else:
+            bracket, time = bracket.after_acceptance(times.end), times.end
+            assert bracket.end is not None
+    assert time <= place <= time + 8.0 * smallest
