@@ -156,9 +156,7 @@ class ControlledRun:
 
     def _first_position(self, y: FloatArray) -> _Position:
         settings, u = self._settings, y[:, self._source]
-        points = (
-            settings.polynomial.points if self._orders is None else settings.polynomial.order + 1
-        )
+        points = settings.polynomial.order + 1  # an input without a derivative needs them all
         depth = self._estimator.points(points) + self._scheme.known_ahead
         depth = max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
         history = CouplingHistory.start(self._start, u, depth)

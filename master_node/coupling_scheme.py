@@ -31,6 +31,7 @@ class CouplingScheme:
         get_outputs: for each slave the call that reads its outputs, with the derivatives where
             they are of use.
         output_rows: 2 when outputs are read with derivatives, else 1.
+        input_has_derivative: for each input whether its polynomial may meet derivatives, (n,).
         has_derivative: for each output whether it is read with its derivative, shape (m,).
         feed_through: for each output whether it depends directly on extrapolated inputs, shape
             (m,).
@@ -43,6 +44,7 @@ class CouplingScheme:
     input_rows: tuple[int, ...]
     get_outputs: tuple[GetOutputs, ...]
     output_rows: int
+    input_has_derivative: NDArray[np.bool_]
     has_derivative: NDArray[np.bool_]
     feed_through: NDArray[np.bool_]
     evaluated: tuple[int, ...]
@@ -97,6 +99,9 @@ class CouplingScheme:
             input_rows=tuple(largest_order(part) + 1 for part in coupled.parts),
             get_outputs=tuple(GetOutputs(order) for order in derivative_orders),
             output_rows=1 + max(derivative_orders),
+            input_has_derivative=np.array(
+                [kinds[i].has_derivative for i in kind_of_input], dtype=bool
+            ),
             has_derivative=has_derivative,
             feed_through=feed_through,
             evaluated=evaluated,

@@ -22,7 +22,6 @@ from master_node.coupling_scheme import CouplingScheme
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import Comparison, ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials
-from master_node.numerics.norms import first_not_finite
 from master_node.slave_group import SlaveGroup
 from master_node.step_requests import (
     RESTORE_HALFWAY,
@@ -81,7 +80,6 @@ class DoubleStepper:
         estimator: ErrorEstimator,
     ) -> None:
         self._source = coupled.source
-        self._names = coupled.output_names
         self._scheme = scheme
         self._is_long_step = estimator.comparison is Comparison.LONG_STEP
         self._requests = StepRequests(group, coupled, scheme)
@@ -153,10 +151,6 @@ class DoubleStepper:
             )
             y_middle, comparison = self._requests.take([small_piece, comparison_piece])
             before_second = (RESTORE_HALFWAY,)
-        bad = first_not_finite(y_middle)
-        if bad is not None:
-            reason = f"{self._names[bad]} is not finite"
-            raise BrokenOffError(FailedStep("", None, float("nan"), reason))
 
         pushed = history.pushed(middle, y_middle.take(self._source, axis=1))
         second_piece = Piece(

@@ -6,7 +6,6 @@ from functools import partial
 from math import ulp
 
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials
-from master_node.numerics.norms import first_not_finite
 from master_node.numerics.step_size_controller import fixed_steps
 from master_node.observers import Attempt
 from master_node.result_points import ResultPoints, count_accepted
@@ -41,7 +40,7 @@ class FixedRun:
         wanted = settings.polynomial
         requests = StepRequests(context.group, coupled, scheme)
         results = ResultPoints(settings.output_grid, scheme.has_derivative, start, y)
-        depth, u = wanted.points + scheme.known_ahead, y[:, coupled.source]
+        depth, u = wanted.order + 1 + scheme.known_ahead, y[:, coupled.source]
         history = (
             CouplingHistory.at_rest(start, u, depth, h)
             if settings.rests_before_start
@@ -64,10 +63,6 @@ class FixedRun:
                 if failed.status is StepStatus.TERMINATED:
                     return f"{failed.slave} ended the simulation after t={time!r} s"
                 raise _error(failed, step) from failed.error
-            bad = first_not_finite(y)
-            if bad is not None:
-                reason = f"{coupled.output_names[bad]} is not finite"
-                raise _error(FailedStep("", None, _NAN, reason), step)
             history = history.pushed(end, y[:, coupled.source])
             count_accepted(context.statistics, step.step_size, ((end, y),))
             order = max(polynomial.order for polynomial in polynomials)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from master_node.coupling_scheme import CouplingScheme
+from master_node.numerics.norms import first_not_finite
 from master_node.output_evaluation import OutputEvaluation
 from master_node.slave_group import Program, SlaveGroup
 from master_node.system import CoupledSystem
@@ -100,7 +101,7 @@ class StepRequests:
 
     def __init__(self, group: SlaveGroup, coupled: CoupledSystem, scheme: CouplingScheme) -> None:
         self._group = group
-        self._outputs = len(coupled.output_names)
+        self._names = coupled.output_names
         self._input_slices = [part.input_slice for part in coupled.parts]
         self._output_slices = [part.output_slice for part in coupled.parts]
         self._scheme = scheme
@@ -118,9 +119,9 @@ class StepRequests:
             The outputs at the end of each piece, shape (rows, m).
 
         Raises:
-            BrokenOffError: a slave did not get to the end.
+            BrokenOffError: a slave did not get to the end, or an output there is not finite.
         """
-        outputs = [np.zeros((piece.rows, self._outputs)) for piece in pieces]
+        outputs = [np.zeros((piece.rows, len(self._names))) for piece in pieces]
         if not self._evaluation.is_needed:
             self._request(pieces, outputs)
             return outputs
@@ -153,6 +154,11 @@ class StepRequests:
                 for y, place in zip(outputs, places, strict=True):
                     values: Any = reply.results[place]
                     y[: len(values), columns] = values
+            for y in outputs:
+                bad = first_not_finite(y)
+                if bad is not None:  # before anyone else gets it
+                    reason = f"{self._names[bad]} is not finite"
+                    raise BrokenOffError(FailedStep("", None, float("nan"), reason))
 
     def _program(
         self, slave: int, pieces: Sequence[Piece], inputs: Sequence[FloatArray]

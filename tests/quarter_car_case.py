@@ -9,7 +9,7 @@ import inspect
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +82,7 @@ class LinearSystem:
     outputs: tuple[str, ...]
     of_states: np.ndarray | None = None
     of_inputs: np.ndarray | None = None
+    propagators: dict[tuple[int, float], np.ndarray] = field(default_factory=dict)
 
     def propagate(self, x: np.ndarray, u: np.ndarray, time: float) -> np.ndarray:
         """The states after ``time`` [s] with polynomial inputs, row j of ``u`` the j-th derivative.
@@ -89,11 +90,16 @@ class LinearSystem:
         (x, u, u', ..., 1) obeys one linear autonomous system, whose solution is an exponential.
         """
         n, (rows, m) = len(x), u.shape
-        system = np.zeros((n + rows * m + 1, n + rows * m + 1))
-        system[:n, :n], system[:n, n : n + m], system[:n, -1] = self.a, self.b, self.c
-        system[n : n + (rows - 1) * m, n + m : n + rows * m] = np.eye((rows - 1) * m)
-        reached: np.ndarray = expm(system * time) @ np.concatenate([x, u.ravel(), [1.0]])
-        return reached[:n]
+        key = (rows, time)
+        if key not in self.propagators:
+            system = np.zeros((n + rows * m + 1, n + rows * m + 1))
+            system[:n, :n], system[:n, n : n + m], system[:n, -1] = self.a, self.b, self.c
+            system[n : n + (rows - 1) * m, n + m : n + rows * m] = np.eye((rows - 1) * m)
+            if len(self.propagators) > 1000:
+                self.propagators.clear()
+            self.propagators[key] = expm(system * time)[:n]
+        reached: np.ndarray = self.propagators[key] @ np.concatenate([x, u.ravel(), [1.0]])
+        return reached
 
     def read(self, x: np.ndarray, u: np.ndarray, order: int) -> np.ndarray:
         """Outputs and, for order 1, their derivatives, from the states and the inputs' rows."""

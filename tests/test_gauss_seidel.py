@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from master_node import load_system, simulate
+from master_node.numerics.extrapolation import POLYNOMIALS, InputPolynomial
 from protocol.calls import StepResult
 from protocol.slave import StepStatus
 from tests.quarter_car_case import (
@@ -20,6 +21,7 @@ from tests.quarter_car_case import (
     car,
     exact_solution,
     global_errors,
+    limit_of_deviations,
     run_slaves,
 )
 
@@ -77,6 +79,62 @@ def test_the_order_is_k_plus_1(k: int, fmu_dir: Path) -> None:
         assert run.error is None
         errors.append(global_errors(run.result)[-1])
     assert np.log2(errors[0] / errors[1]) > min(k + 1, 2) - 0.35
+
+
+@pytest.mark.parametrize("estimator", ["mod", "rich"])
+@pytest.mark.parametrize("polynomial", POLYNOMIALS, ids=str)
+@pytest.mark.parametrize("factor", [1.0, 0.3])
+def test_the_estimate_tends_to_the_true_error(
+    estimator: str, polynomial: InputPolynomial, factor: float
+) -> None:
+    """Law: EST / true local error -> 1 as H -> 0, for inputs known ahead too, after any change."""
+    near, limit = limit_of_deviations(polynomial, factor, estimator=estimator, **SEQUENCE)
+    assert limit == pytest.approx(0.0, abs=0.08)
+    assert near < 0.3
+
+
+class NoNumber(LinearSlave):
+    """Its velocity is no number from t = 0.03 s on."""
+
+    time = 0.0
+
+    def do_step(self, communication_point: float, step_size: float, prior: bool) -> StepResult:
+        """See `Slave`."""
+        self.time = communication_point + step_size
+        return super().do_step(communication_point, step_size, prior)
+
+    def get_outputs(self, order: int) -> np.ndarray:
+        """See `Slave`."""
+        y = super().get_outputs(order)
+        if self.time > 0.03:
+            y[0, 1] = np.nan
+        return y
+
+
+class Hearing(LinearSlave):
+    """Keeps all inputs that it is given."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self.heard: list[np.ndarray] = []
+        super().__init__(*arguments)
+
+    def set_inputs(self, derivatives: np.ndarray) -> None:
+        """See `Slave`."""
+        self.heard.append(derivatives.copy())
+        super().set_inputs(derivatives)
+
+
+@pytest.mark.parametrize("estimator", ["mod", "rich", "none"])
+def test_what_is_no_number_reaches_no_other_slave(estimator: str) -> None:
+    """Law: also where outputs are handed on within a step, NaN stays with whom it comes from."""
+    wheel = Hearing(WHEEL, np.zeros(2))
+    slaves = {"chassis": NoNumber(CHASSIS, np.zeros(2)), "wheel": wheel}
+    options = {"estimator": estimator, "smallest_step_size": 1e-6, **SEQUENCE}
+    run = run_slaves(car(stop_time=0.1, **options), slaves)
+    assert run.error is not None
+    assert "chassis.v is not finite" in str(run.error)
+    assert np.isfinite(run.result.outputs).all()
+    assert all(np.isfinite(u).all() for u in wheel.heard)
 
 
 class Stumbling(LinearSlave):

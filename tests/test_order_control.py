@@ -133,7 +133,9 @@ def test_magnitudes_are_those_of_the_derivatives(
         history = CouplingHistory(
             tuple(times), tuple(np.array([[f(t)] for f in rows]) for t in times), 5
         )
-        found = input_magnitudes(history, np.array([2.0]), np.zeros(1, dtype=np.intp), 1)
+        found = input_magnitudes(
+            history, np.array([slopes]), np.array([2.0]), np.zeros(1, dtype=np.intp), 1
+        )
         assert found.shape == (5, 1)
         assert found[degree, 0] == pytest.approx(2.0 * abs(coefficients[degree]), abs=1e-7)
         assert found[degree + 1 :] == pytest.approx(0.0, abs=1e-6)

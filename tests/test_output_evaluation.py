@@ -331,3 +331,50 @@ def test_an_output_that_cannot_be_evaluated_is_a_rejection() -> None:
     assert "no value" in str(run.error)
     assert run.result.summary["rejected_double_steps"] >= 1
     assert 0.05 < run.result.time[-1] <= 0.1
+
+
+class NoNumber(LinearSlave):
+    """A chassis whose velocity is no number from t = 0.03 s on."""
+
+    time = 0.0
+
+    def do_step(self, communication_point: float, step_size: float, prior: bool) -> StepResult:
+        """See `Slave`."""
+        self.time = communication_point + step_size
+        return super().do_step(communication_point, step_size, prior)
+
+    def get_outputs(self, order: int) -> np.ndarray:
+        """See `Slave`."""
+        y = super().get_outputs(order)
+        if self.time > 0.03:
+            y[0, 1] = np.nan
+        return y
+
+
+class HearingWheel(LinearSlave):
+    """Keeps all inputs that it is given."""
+
+    def __init__(self) -> None:
+        self.heard: list[np.ndarray] = []
+        super().__init__(WHEEL_FORCE, np.zeros(2), FOLLOWS)
+
+    def set_inputs(self, derivatives: np.ndarray) -> None:
+        """See `Slave`."""
+        self.heard.append(derivatives.copy())
+        super().set_inputs(derivatives)
+
+
+@pytest.mark.parametrize("estimator", [*ESTIMATORS, "none"])
+def test_what_is_no_number_reaches_no_other_slave(estimator: str) -> None:
+    """Law: outputs are looked at before they are handed on: NaN stays with whom it comes from."""
+    wheel = HearingWheel()
+    slaves: dict[str, Slave] = {
+        "chassis": NoNumber(CHASSIS_FORCE, np.zeros(2), FOLLOWS),
+        "wheel": wheel,
+    }
+    options = {"estimator": estimator, "smallest_step_size": 1e-6, "stop_time": 0.1}
+    run = run_slaves(force_car(**options), slaves)
+    assert run.error is not None
+    assert "chassis.v is not finite" in str(run.error)
+    assert np.isfinite(run.result.outputs).all()
+    assert all(np.isfinite(u).all() for u in wheel.heard)

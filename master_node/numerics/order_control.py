@@ -122,6 +122,7 @@ def ladder(*, has_derivatives: bool, derivative_points: int) -> tuple[InputPolyn
 
 def input_magnitudes(
     history: CouplingHistory,
+    has_derivative: NDArray[np.bool_],
     weights: FloatArray,
     group_of_input: NDArray[np.intp],
     groups: int,
@@ -133,6 +134,7 @@ def input_magnitudes(
 
     Args:
         history: newest points; as many levels as there are conditions, `DEPTH` at most.
+        has_derivative: which inputs have one in the history, shape (n,).
         weights: of the inputs, shape (n,), unit 1/[u].
         group_of_input: index of the group that an input acts on, shape (n,).
         groups: how many groups there are.
@@ -142,13 +144,14 @@ def input_magnitudes(
     """
     points = min(len(history.times), DEPTH)
     table = _differences(history, [(i, False) for i in range(points)])
-    if len(history.inputs[0]) > 1:
+    if has_derivative.any():
         doubled = [(i, again) for i in range(points) for again in (False, True)[: 1 + (i < 2)]]
         hermite = _differences(history, doubled[:DEPTH])
         common = min(len(table), len(hermite))
-        smaller = np.abs(hermite[:common]) < np.abs(table[:common])
+        smaller = (np.abs(hermite[:common]) < np.abs(table[:common])) & has_derivative
         table[:common] = np.where(smaller, hermite[:common], table[:common])
-        table = np.concatenate((table, hermite[common:]))
+        if has_derivative.all():
+            table = np.concatenate((table, hermite[common:]))
     squares = np.square(table * weights)
     norms: FloatArray = np.sqrt([np.bincount(group_of_input, row, groups) for row in squares])
     return norms

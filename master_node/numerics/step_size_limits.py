@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import ceil, lcm
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.step_size_controller import last_step_size
@@ -81,6 +81,7 @@ class StepSizeLimits:
             quantum, low, high = _decimal(fixed[0]), max(low, fixed), min(high, fixed)
         elif quantum is not None:
             low = max(low, (float(quantum), "the common multiple"))
+            low = (float(-(_decimal(low[0]) // -quantum) * quantum), low[1])
             high = (float(_decimal(high[0]) // quantum * quantum), high[1])
         if low[0] > high[0]:
             raise StepSizeLimitsError(
@@ -120,18 +121,19 @@ class StepSizeLimits:
         """
         if self.quantum is None:
             size = last_step_size(begin, target, step_size)
-            if size < self.smallest:  # one double step for all that is left is longer
-                size = (target - begin) / 2.0
+            size = _planned(size, (target - begin) / 2.0, self.smallest, self.largest)
             is_last = 2.0 * size >= target - begin
             return DoubleStepTimes.from_step_size(begin, size, target if is_last else None)
         quantum, zero = self.quantum, _decimal(origin)
         done = round((Fraction(begin) - zero) / quantum)
-        left_units = round((Fraction(target) - zero) / quantum) - done
-        units = max(1, int(_decimal(step_size) // quantum))
-        if 2 * units >= left_units:
-            units = max(1, left_units // 2)
-        elif 4 * units > left_units:
-            units = max(1, (left_units // 2 + 1) // 2)
+        left = (round((Fraction(target) - zero) / quantum) - done) // 2
+        fewest = max(1, ceil(_decimal(self.smallest) / quantum))
+        units = max(fewest, int(_decimal(step_size) // quantum))
+        if units >= left:
+            units = left
+        elif 2 * units > left:
+            units = (left + 1) // 2
+        units = max(1, _planned(units, left, fewest, int(_decimal(self.largest) // quantum)))
         size = float(units * quantum)
         middle = float(zero + (done + units) * quantum)
         end = float(zero + (done + 2 * units) * quantum)
@@ -141,15 +143,40 @@ class StepSizeLimits:
         """The double step of the smallest size that leads over an event at ``event`` [s].
 
         Its middle is the event; on a grid, which need not meet the event, its end is the first
-        even multiple of the quantum that is not before it.
+        even multiple of the smallest size that is not before it.
         """
         size = self.smallest
         if self.quantum is None:
             return DoubleStepTimes(event - size, event, event + size, size, size)
-        zero, pair = _decimal(origin), 2 * self.quantum
+        zero, step = _decimal(origin), _decimal(size)
+        pair = 2 * step
         end = zero + pair * ceil((_decimal(event) - zero) / pair)
-        begin, middle = float(end - pair), float(end - self.quantum)
+        begin, middle = float(end - pair), float(end - step)
         return DoubleStepTimes(begin, middle, float(end), size, size)
+
+
+_Size = TypeVar("_Size", int, float)
+
+
+def _planned(size: _Size, left: _Size, smallest: _Size, largest: _Size) -> _Size:
+    """A size near ``size`` that leaves a rest which sizes between the bounds can fill.
+
+    n sizes fill what is between n times the smallest and n times the largest. A rest in a gap
+    between these is made larger if this size can be so small, else smaller.
+
+    Args:
+        size: that is wanted, not more than ``left``.
+        left: to fill with this size and those that follow.
+        smallest: bound of all of them.
+        largest: bound of all of them.
+    """
+    rest = left - size
+    number = ceil(rest / largest)
+    if number * smallest <= rest:
+        return size
+    if left - number * smallest >= smallest:
+        return left - number * smallest
+    return min(left, left - (number - 1) * largest)
 
 
 def _fixed(

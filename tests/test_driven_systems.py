@@ -1,0 +1,189 @@
+"""One slave drives another: nothing comes back, so only what is handed on tells of an error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from master_node import Result, System
+from protocol.calls import StepResult
+from protocol.slave import (
+    Causality,
+    Slave,
+    SlaveDescription,
+    StartValue,
+    StepStatus,
+    Variable,
+)
+from tests.quarter_car_case import ALL, LinearSystem, run_slaves
+
+Jumps = Sequence[tuple[float, float]]
+SEQUENCES = ("jacobi", "gauss-seidel")
+STOP = 3.0
+
+OSCILLATOR = LinearSystem(
+    a=np.array([[0.0, 1.0], [-30.0, -1.0]]),
+    b=np.array([[0.0], [30.0]]),
+    c=np.zeros(2),
+    inputs=("u",),
+    outputs=("x", "v"),
+)
+
+
+class JumpingSource(Slave):
+    """y jumps by a at t_i, for each (t_i, a); from t_i on it has the new value."""
+
+    def __init__(self, jumps: Jumps) -> None:
+        self.jumps = jumps
+        self.description = SlaveDescription(
+            model="jumps",
+            kind="test",
+            variables=(Variable("y", Causality.OUTPUT),),
+            capabilities=replace(ALL, max_output_derivative_order=1),
+            state_kind="native",
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """See `Slave`."""
+        self.time = 0.0
+
+    def initialize(
+        self,
+        *,
+        start_time: float,
+        stop_time: float | None,
+        relative_tolerance: float | None,
+        start_values: Mapping[str, StartValue],
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+    ) -> None:
+        """See `Slave`."""
+        self.time = start_time
+
+    def exit_initialization_mode(self) -> None:
+        """See `Slave`."""
+
+    def set_inputs(self, derivatives: np.ndarray) -> None:
+        """See `Slave`."""
+
+    def do_step(
+        self, communication_point: float, step_size: float, no_set_state_prior: bool
+    ) -> StepResult:
+        """See `Slave`."""
+        self.time = communication_point + step_size
+        return StepResult(StepStatus.OK, self.time)
+
+    def get_outputs(self, order: int) -> np.ndarray:
+        """See `Slave`."""
+        y = sum(jump for time, jump in self.jumps if self.time >= time)
+        return np.array([[y], [0.0]][: order + 1])
+
+    def get_state(self) -> object:
+        """See `Slave`."""
+        return self.time
+
+    def set_state(self, state: object) -> None:
+        """See `Slave`."""
+        assert isinstance(state, float)
+        self.time = state
+
+    def free_state(self, state: object) -> None:
+        """See `Slave`."""
+
+    def serialize_state(self, state: object) -> bytes:
+        """See `Slave`."""
+        raise NotImplementedError
+
+    def deserialize_state(self, data: bytes) -> object:
+        """See `Slave`."""
+        raise NotImplementedError
+
+    def terminate(self) -> None:
+        """See `Slave`."""
+
+    def close(self) -> None:
+        """See `Slave`."""
+
+
+def driven(jumps: Jumps, **simulation: Any) -> Result:
+    """An oscillator under a force that jumps."""
+    system = System(
+        simulation={"stop_time": STOP, **simulation},
+        slaves={"source": {}, "oscillator": {}},
+        connections=[("source.y", "oscillator.u")],
+    )
+    can = replace(ALL, max_output_derivative_order=1)
+    slaves = {"source": JumpingSource(jumps), "oscillator": OSCILLATOR.slave(capabilities=can)}
+    run = run_slaves(system, slaves)
+    if run.error is not None:
+        raise run.error
+    return run.result
+
+
+def largest_error(result: Result, jumps: Jumps) -> float:
+    """Of the oscillator's states, at all points of the result."""
+    exact = np.zeros((len(result.time), 2))
+    for row, time in zip(exact, result.time.tolist(), strict=True):
+        for begin, jump in jumps:
+            if time > begin:
+                row += OSCILLATOR.propagate(np.zeros(2), np.array([[jump]]), time - begin)
+    y = np.column_stack([result["oscillator.x"], result["oscillator.v"]])
+    return float(np.abs(y - exact).max())
+
+
+@pytest.mark.parametrize("sequence", SEQUENCES)
+@pytest.mark.parametrize("estimator", ["rich", "mod"])
+@pytest.mark.parametrize("order", ["auto", 0, 1, 2, 3])
+@settings(max_examples=8)
+@given(time=st.floats(0.1, 2.9), jump=st.sampled_from([1.0, -0.05, 30.0]))
+def test_a_jump_is_found_wherever_it_is(
+    sequence: str, estimator: str, order: Any, time: float, jump: float
+) -> None:
+    """Law: at any time, of any size above the tolerance, with any order and sequence.
+
+    The input is constant before and behind it, so that nothing else is an error: what is left is
+    the smallest step's.
+    """
+    jumps = [(time, jump)]
+    result = driven(jumps, sequence=sequence, estimator=estimator, order=order)
+    assert result.summary["discontinuities"] == 1
+    assert largest_error(result, jumps) < 1e-5 * abs(jump)
+
+
+@pytest.mark.parametrize("sequence", SEQUENCES)
+@settings(max_examples=8)
+@given(
+    times=st.lists(st.floats(0.1, 2.9), min_size=2, max_size=4, unique=True).filter(
+        lambda times: np.diff(sorted(times)).min() > 0.01
+    )
+)
+def test_many_jumps_are_found_one_after_the_other(sequence: str, times: list[float]) -> None:
+    """Law: each of them once."""
+    jumps = [(time, (-1.0) ** i) for i, time in enumerate(sorted(times))]
+    result = driven(jumps, sequence=sequence)
+    assert result.summary["discontinuities"] == len(jumps)
+    assert largest_error(result, jumps) < 1e-4
+
+
+@pytest.mark.parametrize("sequence", SEQUENCES)
+@pytest.mark.parametrize("order", ["auto", 2])
+def test_results_between_points_are_as_good_as_the_tolerance_asks(
+    sequence: str, order: Any
+) -> None:
+    """Law: also where the coupling is no reason for small steps, as under a constant force.
+
+    There ERR is 0 and H grows until an oscillation has its place between two points.
+    """
+    jumps = [(0.0, 1.0)]
+    points = driven(jumps, sequence=sequence, order=order)
+    assert largest_error(points, jumps) < 1e-9
+    grid = driven(jumps, sequence=sequence, order=order, output_interval=0.01)
+    assert len(grid.time) == 301
+    assert largest_error(grid, jumps) < 1e-2

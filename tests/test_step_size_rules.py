@@ -1,0 +1,187 @@
+"""Rules of slaves for the size of their steps, in whole runs: every do_step of every slave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from master_node import Result, System
+from master_node.numerics.step_size_limits import (
+    SlaveLimits,
+    StepSizeLimits,
+    StepSizeLimitsError,
+)
+from protocol.calls import StepResult
+from protocol.errors import ConfigurationError
+from protocol.slave import Capabilities, Slave
+from tests.quarter_car_case import ALL, CHASSIS, DISPLACEMENT, WHEEL, LinearSlave, run_slaves
+
+STOP = 0.24
+Rules = Mapping[str, float]
+
+
+class Timed(LinearSlave):
+    """Notes where its do_steps begin and how long they are."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self.steps: list[tuple[float, float]] = []
+        super().__init__(*arguments)
+
+    def do_step(self, communication_point: float, step_size: float, prior: bool) -> StepResult:
+        """See `Slave`."""
+        self.steps.append((communication_point, step_size))
+        return super().do_step(communication_point, step_size, prior)
+
+
+def run(
+    chassis: Rules, wheel: Rules, can: Capabilities = ALL, **simulation: Any
+) -> tuple[Result, dict[str, Timed]]:
+    """The car under these rules, with loose tolerances."""
+    slaves = {
+        "chassis": Timed(CHASSIS, np.zeros(2), can),
+        "wheel": Timed(WHEEL, np.zeros(2), can),
+    }
+    loose = {"relative_tolerance": 0.1, "absolute_tolerance": 0.1}
+    system = System(
+        simulation={"stop_time": STOP, **loose, **simulation},
+        slaves={"chassis": dict(chassis), "wheel": dict(wheel)},
+        connections=DISPLACEMENT,
+    )
+    given_slaves: dict[str, Slave] = dict(slaves)
+    found = run_slaves(system, given_slaves)
+    if found.error is not None:
+        raise found.error
+    return found.result, slaves
+
+
+def assert_obeyed(rules: Rules, slave: Timed) -> None:
+    """By each do_step, up to the rounding of a difference of times."""
+    sizes = np.array([size for _, size in slave.steps])
+    slack = 1e-12
+    if "step_size" in rules:
+        assert sizes == pytest.approx(np.full(len(sizes), rules["step_size"]), rel=slack)
+    if "step_multiple" in rules:
+        numbers = sizes / rules["step_multiple"]
+        assert numbers == pytest.approx(np.round(numbers), rel=1e-9)
+        assert numbers.min() > 0.5
+    assert sizes.min() >= rules.get("smallest_step_size", 0.0) - slack
+    assert sizes.max() <= rules.get("largest_step_size", STOP) + slack
+
+
+def rules_of(multiples: st.SearchStrategy[float]) -> st.SearchStrategy[Rules]:
+    """Some rules of a slave; each may be missing."""
+    return st.fixed_dictionaries(
+        {},
+        optional={
+            "step_multiple": multiples,
+            "smallest_step_size": st.sampled_from([1e-4, 1e-3, 1.5e-3]),
+            "largest_step_size": st.sampled_from([4e-3, 5e-3, 0.013]),
+        },
+    )
+
+
+some_rules = rules_of(st.sampled_from([1e-4, 5e-4, 1e-3]))
+
+
+@settings(max_examples=30)
+@given(
+    some_rules,
+    some_rules,
+    st.sampled_from(["rich", "mod"]),
+    st.sampled_from(["jacobi", "gauss-seidel"]),
+    st.sampled_from([(), (0.08,), (0.08, 0.16)]),
+)
+def test_every_do_step_of_every_slave_obeys_its_rules(
+    chassis: Rules, wheel: Rules, estimator: str, sequence: str, events: tuple[float, ...]
+) -> None:
+    """Law: whatever the rules, the steps keep to them, and end exactly on the stop time.
+
+    Long comparison steps and rejected attempts too, and those at declared events.
+    """
+    options = {"estimator": estimator, "sequence": sequence, "events": events, "order": 2}
+    result, slaves = run(chassis, wheel, **options)
+    assert_obeyed(chassis, slaves["chassis"])
+    assert_obeyed(wheel, slaves["wheel"])
+    assert result.time[-1] == STOP
+
+
+bounds = st.integers(1, 60).map(lambda n: n / 100)
+
+
+@given(
+    st.lists(st.sampled_from([0.01, 0.02, 0.05, 0.03]), max_size=2),
+    bounds,
+    st.integers(3, 9),
+    st.integers(1, 100),
+    st.lists(bounds, min_size=1, max_size=8),
+)
+def test_the_bounds_hold_to_the_last_step(
+    multiples: list[float], smallest: float, factor: int, length: int, wanted: list[float]
+) -> None:
+    """Law: whatever H is wanted, what is taken keeps to all rules on the whole way to the target.
+
+    Where there is any way at all: a target that is nearer than two of the smallest steps, or that
+    can only be reached with too large or too small ones, has none.
+    """
+    rules = [SlaveLimits(f"s{i}", step_multiple=m) for i, m in enumerate(multiples)]
+    largest = round(factor * smallest, 2)
+    rules.append(SlaveLimits("t", smallest_step_size=smallest, largest_step_size=largest))
+    target = length / 10
+    try:
+        limits = StepSizeLimits.of(rules, 1e-9, 1e3, long_step=False)
+        limits.check_span(0.0, target)
+    except StepSizeLimitsError:
+        return
+    quantum = float(limits.quantum or 0.0)
+    if largest < 3.0 * (smallest + quantum) or target < 2.0 * (smallest + quantum):
+        return
+    time, number = 0.0, 0
+    while time < target:
+        size = min(limits.largest, max(limits.smallest, wanted[number % len(wanted)]))
+        times = limits.times(0.0, time, size, target)
+        assert smallest - 1e-12 <= times.first <= largest + 1e-12
+        assert smallest - 1e-12 <= times.second <= largest + 1e-12
+        for multiple in multiples:
+            assert Fraction(repr(times.first)) % Fraction(repr(multiple)) == 0
+        assert times.end > time
+        time, number = times.end, number + 1
+    assert time == target
+
+
+def test_a_slave_of_one_step_size_among_others() -> None:
+    """A slave that cannot change its step size is controlled when its size is given.
+
+    There is nothing to change, so an error that is too large ends the run; EST_Rich, which takes
+    steps of 2H, is refused.
+    """
+    can = Capabilities(can_get_and_set_state=True, can_interpolate_inputs=True)
+    with pytest.raises(ConfigurationError, match=r"give \[slaves\.chassis\] step_size"):
+        run({}, {}, can)
+    rules = {"step_size": 2e-3}
+    result, slaves = run(rules, rules, can)
+    for slave in slaves.values():
+        assert_obeyed(rules, slave)
+    assert len(result.time) == 121
+    with pytest.raises(ConfigurationError, match=r"takes steps of 0\.002 s only"):
+        run(rules, rules, can, estimator="rich")
+
+
+def test_multiples_of_slaves_meet() -> None:
+    """H is a multiple of 2 ms and of 3 ms: of 6 ms."""
+    result, _ = run({"step_multiple": 2e-3}, {"step_multiple": 3e-3}, order=2)
+    assert np.diff(result.time) / 6e-3 == pytest.approx(np.round(np.diff(result.time) / 6e-3))
+    with pytest.raises(ConfigurationError, match=r"no even number of steps of 0\.006 s"):
+        run({"step_multiple": 2e-3}, {"step_multiple": 3e-3}, stop_time=0.25)
+
+
+def test_points_on_a_grid_do_not_drift() -> None:
+    """Law: hundreds of steps later a point is still n times 0.1 ms, to the last bit."""
+    result, _ = run({"step_multiple": 1e-4}, {}, relative_tolerance=1e-3, absolute_tolerance=1e-3)
+    numbers = np.round(result.time / 1e-4)
+    assert result.time.tolist() == [float(Fraction(int(n), 10000)) for n in numbers]
