@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
+
+# Threads only get in each other's way on matrices of a few rows. Read where NumPy is imported.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+import importlib.util
 import socket
 import sys
 from collections.abc import Callable, Iterator
