@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System, load_system, simulate
@@ -82,6 +82,7 @@ def test_a_jump_is_localised_to_the_smallest_step(
 
 @settings(max_examples=15, deadline=None)
 @given(t_step=st.floats(0.05, 9.0))
+@example(t_step=1.3609246379327429)  # rejections alone shorten H until ERR is below 1
 def test_a_jump_is_found_wherever_it_is(
     oscillator_dir: Path, oscillators: ModuleType, t_step: float
 ) -> None:
