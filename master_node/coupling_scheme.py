@@ -17,6 +17,7 @@ from master_node.numerics.extrapolation import Extrapolation, InputKind
 from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import GetOutputs
 from protocol.signals import MAX_ORDER
+from protocol.slave import InputDerivatives
 
 
 @dataclass(frozen=True)
@@ -110,8 +111,8 @@ class CouplingScheme:
 
 
 def largest_order(part: SlavePart) -> int:
-    """The highest degree of input polynomial that a slave takes: 0 without canInterpolateInputs."""
-    return MAX_ORDER if part.description.capabilities.can_interpolate_inputs else 0
+    """The highest degree of input polynomial that a slave follows."""
+    return 0 if part.description.input_derivatives is InputDerivatives.NONE else MAX_ORDER
 
 
 def _evaluated(coupled: CoupledSystem, system: System) -> tuple[int, ...]:

@@ -264,5 +264,5 @@ class _Presence:
     def _whereabouts(self, key: SlaveKey) -> str:
         with suppress(DoublestepError):
             status = slave_status(self._bus, key)
-            return f"{status.get('host')}/{status.get('pid')}"
+            return f"{status.get('host')!s}/{status.get('pid')!s}"
         return key.instance

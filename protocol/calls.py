@@ -26,6 +26,26 @@ class Describe:
 
 
 @dataclass(frozen=True, slots=True)
+class Configure:
+    """Load the model anew, as it is to be run. Result: the `SlaveDescription` that holds now.
+
+    Attributes:
+        state_kind: how to save its state, a `StateKind`; "": the best way that it allows.
+        structural_parameters: by variable name; set in FMI 3's configuration mode.
+        largest_substep: steps of the model are at most this long [s]; longer communication steps
+            are split. None: they are not.
+        input_substeps: into how many substeps a communication step is split where polynomial
+            inputs are emulated; 0: as many as the accuracy needs.
+    """
+
+    verb: ClassVar[str] = "configure"
+    state_kind: str = ""
+    structural_parameters: Mapping[str, StartValue] = field(default_factory=dict)
+    largest_substep: float | None = None
+    input_substeps: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Initialize:
     """fmi2SetupExperiment, start values, fmi2EnterInitializationMode. Result: None.
 
@@ -36,6 +56,9 @@ class Initialize:
         start_values: by variable name, parameters and others.
         inputs: names of the inputs that the master will set, in the order of `SetInputs`.
         outputs: names of the outputs that the master will read, in the order of `GetOutputs`.
+        discrete_inputs: the same for `SetDiscreteInputs`.
+        discrete_outputs: the same for `GetDiscreteOutputs`.
+        early_return: whether a step may end at an event within it.
     """
 
     verb: ClassVar[str] = "initialize"
@@ -45,6 +68,9 @@ class Initialize:
     start_values: Mapping[str, StartValue] = field(default_factory=dict)
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
+    discrete_inputs: tuple[str, ...] = ()
+    discrete_outputs: tuple[str, ...] = ()
+    early_return: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +78,25 @@ class ExitInitializationMode:
     """fmi2ExitInitializationMode. Result: None."""
 
     verb: ClassVar[str] = "exit_initialization_mode"
+
+
+@dataclass(frozen=True, slots=True)
+class Examine:
+    """Take trial steps and go back: can the slave be trusted? Result: `Examination`.
+
+    Unless its verdict is ``exact`` the slave need not stand where it stood: reset it then.
+
+    Attributes:
+        communication_point: where the slave stands [s].
+        step_size: of the trial steps [s].
+        relative_tolerance, absolute_tolerance: of the coupling; weights for differences.
+    """
+
+    verb: ClassVar[str] = "examine"
+    communication_point: float
+    step_size: float
+    relative_tolerance: float = 1e-4
+    absolute_tolerance: float = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +109,14 @@ class SetInputs:
 
     verb: ClassVar[str] = "set_inputs"
     derivatives: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class SetDiscreteInputs:
+    """Values of the discrete inputs from the current communication point on. Result: None."""
+
+    verb: ClassVar[str] = "set_discrete_inputs"
+    values: tuple[StartValue, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +145,13 @@ class GetOutputs:
 
 
 @dataclass(frozen=True, slots=True)
+class GetDiscreteOutputs:
+    """Values of the discrete outputs. Result: a tuple of them."""
+
+    verb: ClassVar[str] = "get_discrete_outputs"
+
+
+@dataclass(frozen=True, slots=True)
 class GetState:
     """fmi2GetFMUstate: save the state under the number ``state``. Result: None.
 
@@ -104,10 +164,14 @@ class GetState:
 
 @dataclass(frozen=True, slots=True)
 class SetState:
-    """fmi2SetFMUstate: go back to the saved state ``state``, which stays saved. Result: None."""
+    """fmi2SetFMUstate: go back to the saved state ``state``. Result: None.
+
+    It stays saved, unless ``free``.
+    """
 
     verb: ClassVar[str] = "set_state"
     state: int
+    free: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,11 +218,15 @@ class Reset:
 
 Call = (
     Describe
+    | Configure
     | Initialize
     | ExitInitializationMode
+    | Examine
     | SetInputs
+    | SetDiscreteInputs
     | DoStep
     | GetOutputs
+    | GetDiscreteOutputs
     | GetState
     | SetState
     | FreeState
@@ -170,11 +238,15 @@ Call = (
 
 CALLS: tuple[type[Call], ...] = (
     Describe,
+    Configure,
     Initialize,
     ExitInitializationMode,
+    Examine,
     SetInputs,
+    SetDiscreteInputs,
     DoStep,
     GetOutputs,
+    GetDiscreteOutputs,
     GetState,
     SetState,
     FreeState,
@@ -189,7 +261,7 @@ class StepResult(NamedTuple):
     """How a `DoStep` ended.
 
     Attributes:
-        status: ok, discard or terminated.
+        status: ok, discard, early_return or terminated.
         time: where the slave stands [s]; on discard the last successful time, NaN if not told.
     """
 

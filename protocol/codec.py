@@ -39,15 +39,19 @@ import numpy as np
 from protocol.calls import (
     CALLS,
     Call,
+    Configure,
     Describe,
     DeserializeState,
     DoStep,
+    Examine,
     FreeState,
+    GetDiscreteOutputs,
     GetOutputs,
     GetState,
     Initialize,
     Reply,
     SerializeState,
+    SetDiscreteInputs,
     SetInputs,
     SetState,
     StepResult,
@@ -57,9 +61,14 @@ from protocol.signals import MAX_ORDER, FloatArray
 from protocol.slave import (
     Capabilities,
     Causality,
+    Examination,
+    InputDerivatives,
     SlaveDescription,
     StartValue,
+    StateKind,
+    StateVerdict,
     StepStatus,
+    Unit,
     Variable,
     VariableType,
 )
@@ -183,9 +192,20 @@ def _texts(value: Any, what: str) -> tuple[str, ...]:
 
 
 def _start_value(value: Any, what: str) -> StartValue:
-    if type(value) in (float, int, bool, str):
+    if type(value) in _VALUE_TYPES:
         return value  # type: ignore[no-any-return]
-    raise MalformedMessageError(f"{what} must be a number, boolean or string, not {_shown(value)}")
+    raise MalformedMessageError(
+        f"{what} must be a number, boolean, string or bytes, not {_shown(value)}"
+    )
+
+
+_VALUE_TYPES: Final = frozenset({float, int, bool, str, bytes})
+
+
+def _values(value: Any, what: str) -> tuple[StartValue, ...]:
+    if type(value) is list and len(value) <= MAX_COLUMNS:
+        return tuple(_start_value(item, what) for item in value)
+    raise MalformedMessageError(f"{what} must be a list of values, not {_shown(value)}")
 
 
 def _mapping(value: Any, what: str) -> dict[str, Any]:
@@ -207,6 +227,12 @@ def _dependencies(value: Any, what: str) -> dict[str, tuple[str, ...]]:
 _Check = Callable[[Any, str], Any]
 
 _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
+    Configure: {
+        "state_kind": _text,
+        "structural_parameters": _start_values,
+        "largest_substep": _optional_number,
+        "input_substeps": _integer,
+    },
     Initialize: {
         "start_time": _number,
         "stop_time": _optional_number,
@@ -214,8 +240,18 @@ _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
         "start_values": _start_values,
         "inputs": _texts,
         "outputs": _texts,
+        "discrete_inputs": _texts,
+        "discrete_outputs": _texts,
+        "early_return": _boolean,
+    },
+    Examine: {
+        "communication_point": _number,
+        "step_size": _number,
+        "relative_tolerance": _number,
+        "absolute_tolerance": _number,
     },
     SetInputs: {"derivatives": _array},
+    SetDiscreteInputs: {"values": _values},
     DoStep: {
         "communication_point": _number,
         "step_size": _number,
@@ -223,7 +259,7 @@ _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
     },
     GetOutputs: {"order": _integer},
     GetState: {"state": _integer},
-    SetState: {"state": _integer},
+    SetState: {"state": _integer, "free": _boolean},
     FreeState: {"state": _integer},
     SerializeState: {"state": _integer},
     DeserializeState: {"state": _integer, "data": _binary},
@@ -479,7 +515,7 @@ def _plain(result: object) -> Any:
         return [len(result), _float_bytes(result)]
     if isinstance(result, StepResult):
         return [result.status.value, result.time]
-    if isinstance(result, SlaveDescription):
+    if isinstance(result, SlaveDescription | Examination):
         return asdict(result)
     return result
 
@@ -536,8 +572,12 @@ def _reply_plan(shape: bytes, kinds: tuple[type[Call], ...]) -> _Plan:
             builder.add_made(_array_maker(size), size[0] * size[1])
         elif kind is DoStep:
             builder.add_made(_step_result_maker(_member(StepStatus, item)), 1)
-        elif kind is Describe:
+        elif kind is Describe or kind is Configure:
             builder.add(_description(item))
+        elif kind is Examine:
+            builder.add(_record(Examination, item, _EXAMINATION_FIELDS))
+        elif kind is GetDiscreteOutputs:
+            builder.add(_values(item, "discrete outputs"))
         elif kind is SerializeState:
             builder.add(_binary(item, "a serialized state"))
         elif item is None:
@@ -582,6 +622,23 @@ def _variables(value: Any, what: str) -> tuple[Variable, ...]:
     return tuple(_variable(item) for item in value)
 
 
+def _unit(value: Any, _what: str) -> Unit:
+    return _record(Unit, value, _UNIT_FIELDS)  # type: ignore[no-any-return]
+
+
+def _exponents(value: Any, what: str) -> tuple[int, ...]:
+    if type(value) is list and len(value) == 8 and all(type(item) is int for item in value):
+        return tuple(value)
+    raise MalformedMessageError(f"{what} must be eight integers, not {_shown(value)}")
+
+
+_UNIT_FIELDS: Mapping[str, _Check] = {
+    "exponents": _exponents,
+    "factor": _number,
+    "offset": _number,
+}
+
+
 def _capabilities(value: Any, _what: str) -> Capabilities:
     return _record(Capabilities, value, _CAPABILITY_FIELDS)  # type: ignore[no-any-return]
 
@@ -615,10 +672,28 @@ _DESCRIPTION_FIELDS: Mapping[str, _Check] = {
     "capabilities": _capabilities,
     "feed_through": _dependencies,
     "initial_feed_through": _dependencies,
-    "state_kind": _text,
+    "state_kind": lambda value, _: _member(StateKind, value),
+    "state_reason": _text,
+    "input_derivatives": lambda value, _: _member(InputDerivatives, value),
+    "fixed_step_size": _optional_number,
+    "default_step_size": _optional_number,
+    "units": lambda value, what: {
+        name: _unit(item, what) for name, item in _mapping(value, what).items()
+    },
+    "remarks": _texts,
     "sha256": _text,
     "guid": _text,
     "generation_tool": _text,
+}
+
+
+_EXAMINATION_FIELDS: Mapping[str, _Check] = {
+    "state_verdict": lambda value, _: _member(StateVerdict, value),
+    "state_reason": _text,
+    "difference": _number,
+    "internal_clock": _optional_number,
+    "step_dependence": _number,
+    "largest_substep": _optional_number,
 }
 
 

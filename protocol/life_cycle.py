@@ -1,8 +1,8 @@
 """The life cycle of a slave as one table: {state: {call: next state}}.
 
 It follows the co-simulation state machine of FMI 2.0 (section 4.2.4). What is not in the table
-is refused with a `LifeCycleError` before the slave sees it. Besides the table, a `DoStep` that is
-discarded leads to ``STEP_FAILED``, a failed call to ``ERROR``, and fmi2Fatal to ``FATAL``.
+is refused with a `LifeCycleError` before the slave sees it. Besides the table, a `DoStep` that does
+not reach its end leads to ``STEP_FAILED``, a failed call to ``ERROR``, and fmi2Fatal to ``FATAL``.
 """
 
 from __future__ import annotations
@@ -12,16 +12,20 @@ from enum import StrEnum
 
 from protocol.calls import (
     Call,
+    Configure,
     Describe,
     DeserializeState,
     DoStep,
+    Examine,
     ExitInitializationMode,
     FreeState,
+    GetDiscreteOutputs,
     GetOutputs,
     GetState,
     Initialize,
     Reset,
     SerializeState,
+    SetDiscreteInputs,
     SetInputs,
     SetState,
     Terminate,
@@ -50,19 +54,24 @@ _X = LifeCycleState.FATAL
 _T = LifeCycleState.TERMINATED
 
 LIFE_CYCLE: Mapping[LifeCycleState, Mapping[type[Call], LifeCycleState]] = {
-    _I: {Describe: _I, Initialize: _M, Reset: _I},
+    _I: {Describe: _I, Configure: _I, Initialize: _M, Reset: _I},
     _M: {
         Describe: _M,
         SetInputs: _M,
+        SetDiscreteInputs: _M,
         GetOutputs: _M,
+        GetDiscreteOutputs: _M,
         ExitInitializationMode: _C,
         Reset: _I,
     },
     _C: {
         Describe: _C,
+        Examine: _C,
         SetInputs: _C,
+        SetDiscreteInputs: _C,
         DoStep: _C,
         GetOutputs: _C,
+        GetDiscreteOutputs: _C,
         GetState: _C,
         SetState: _C,
         FreeState: _C,
@@ -74,6 +83,7 @@ LIFE_CYCLE: Mapping[LifeCycleState, Mapping[type[Call], LifeCycleState]] = {
     _F: {
         Describe: _F,
         GetOutputs: _F,
+        GetDiscreteOutputs: _F,
         SetState: _C,
         FreeState: _F,
         SerializeState: _F,
@@ -85,6 +95,7 @@ LIFE_CYCLE: Mapping[LifeCycleState, Mapping[type[Call], LifeCycleState]] = {
     _T: {
         Describe: _T,
         GetOutputs: _T,
+        GetDiscreteOutputs: _T,
         SetState: _C,
         FreeState: _T,
         SerializeState: _T,

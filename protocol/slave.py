@@ -14,14 +14,17 @@ from enum import StrEnum
 from typing import Protocol
 
 from protocol.calls import Call, Reply, StepResult
+from protocol.errors import SlaveError
 from protocol.signals import FloatArray
 
-StartValue = float | int | bool | str
+StartValue = float | int | bool | str | bytes
+"""A value of a variable of any type; an enumeration's is its number."""
 
 
 class Causality(StrEnum):
-    """FMI 2.0, section 2.2.7."""
+    """FMI 2.0, section 2.2.7, and FMI 3.0, section 2.4.7.4."""
 
+    STRUCTURAL_PARAMETER = "structuralParameter"
     PARAMETER = "parameter"
     CALCULATED_PARAMETER = "calculatedParameter"
     INPUT = "input"
@@ -31,18 +34,103 @@ class Causality(StrEnum):
 
 
 class VariableType(StrEnum):
-    """The base types of FMI 2.0."""
+    """The types of FMI 2.0 and FMI 3.0. Real is Float64 and Integer is Int32 by another name."""
 
     REAL = "Real"
     INTEGER = "Integer"
     BOOLEAN = "Boolean"
     STRING = "String"
     ENUMERATION = "Enumeration"
+    FLOAT32 = "Float32"
+    FLOAT64 = "Float64"
+    INT8 = "Int8"
+    UINT8 = "UInt8"
+    INT16 = "Int16"
+    UINT16 = "UInt16"
+    INT32 = "Int32"
+    UINT32 = "UInt32"
+    INT64 = "Int64"
+    UINT64 = "UInt64"
+    BINARY = "Binary"
+    CLOCK = "Clock"
+
+    @property
+    def is_real(self) -> bool:
+        """Whether its values are floating-point numbers."""
+        return self in _REAL_TYPES
+
+    @property
+    def integer_range(self) -> tuple[int, int] | None:
+        """The smallest and the largest value of an integer type; None for other types."""
+        return _INTEGER_RANGES.get(self)
+
+
+_REAL_TYPES = frozenset({VariableType.REAL, VariableType.FLOAT32, VariableType.FLOAT64})
+
+
+def _signed(bits: int) -> tuple[int, int]:
+    return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+
+
+_INTEGER_RANGES = {
+    VariableType.INTEGER: _signed(32),
+    VariableType.ENUMERATION: _signed(64),
+    VariableType.INT8: _signed(8),
+    VariableType.UINT8: (0, 2**8 - 1),
+    VariableType.INT16: _signed(16),
+    VariableType.UINT16: (0, 2**16 - 1),
+    VariableType.INT32: _signed(32),
+    VariableType.UINT32: (0, 2**32 - 1),
+    VariableType.INT64: _signed(64),
+    VariableType.UINT64: (0, 2**64 - 1),
+}
+
+
+class StateKind(StrEnum):
+    """How the state of a slave is saved and restored.
+
+    ``NATIVE``: by the model itself. ``FORK``: the process that holds the model forks, and the copy
+    stays frozen as the saved state. ``REPLAY``: the model is reset and everything since its
+    instantiation done again. ``NONE``: not at all.
+    """
+
+    NATIVE = "native"
+    FORK = "fork"
+    REPLAY = "replay"
+    NONE = "none"
+
+
+class InputDerivatives(StrEnum):
+    """How a slave follows polynomial inputs.
+
+    ``NATIVE``: the model takes derivatives. ``EMULATED``: its slave node splits each step into
+    substeps with constant inputs. ``NONE``: inputs are constant in each step.
+    """
+
+    NATIVE = "native"
+    EMULATED = "emulated"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A unit in terms of SI base units: value_SI = factor * value + offset (FMI 2.0, 2.2.2).
+
+    Attributes:
+        exponents: of kg, m, s, A, K, mol, cd, rad.
+        factor, offset: see above.
+    """
+
+    exponents: tuple[int, ...] = (0, 0, 0, 0, 0, 0, 0, 0)
+    factor: float = 1.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A variable of a slave, in FMI's words.
+    """A scalar variable of a slave, in FMI's words.
+
+    The elements of an array are variables of their own, named ``array[i,j]`` with indices from 1.
 
     Attributes:
         name: unique within the slave.
@@ -63,7 +151,7 @@ class Variable:
     @property
     def is_continuous_real(self) -> bool:
         """True for what takes part in extrapolation and in the error norm."""
-        return self.type is VariableType.REAL and self.variability == "continuous"
+        return self.type.is_real and self.variability == "continuous"
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,13 +178,20 @@ class SlaveDescription:
 
     Attributes:
         model: model name.
-        kind: ``FMI 2.0 co-simulation`` or ``Python model``.
+        kind: such as ``FMI 2.0 co-simulation``, ``FMI 3.0 model exchange`` or ``Python model``.
         sha256: of the FMU file or of the Python source, hexadecimal.
         variables: all of them, in the order of the model description.
         feed_through: for each output the inputs on which it depends directly, at a
             communication point (ModelStructure/Outputs); outputs not named depend on none.
         initial_feed_through: the same in initialization mode (ModelStructure/InitialUnknowns).
-        state_kind: how its state is saved: ``native`` or ``none``.
+        state_kind: how its state is saved.
+        state_reason: why it is not saved natively; "" if it is.
+        input_derivatives: how it follows polynomial inputs.
+        fixed_step_size: the only communication step size that it takes [s]; None: any.
+        default_step_size: that the model recommends [s]; None: it does not.
+        units: definitions of the units of its variables, by name; a unit that is not among them
+            is only a name.
+        remarks: on what of the model is not carried, for the user.
     """
 
     model: str
@@ -105,7 +200,13 @@ class SlaveDescription:
     capabilities: Capabilities = Capabilities()
     feed_through: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     initial_feed_through: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    state_kind: str = "none"
+    state_kind: StateKind = StateKind.NONE
+    state_reason: str = ""
+    input_derivatives: InputDerivatives = InputDerivatives.NONE
+    fixed_step_size: float | None = None
+    default_step_size: float | None = None
+    units: Mapping[str, Unit] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
     sha256: str = ""
     guid: str = ""
     generation_tool: str = ""
@@ -123,11 +224,54 @@ class SlaveDescription:
 
 
 class StepStatus(StrEnum):
-    """How a do_step ended when it raised nothing."""
+    """How a do_step ended when it raised nothing.
+
+    ``EARLY_RETURN``: the slave stands at an event within the step (FMI 3.0, section 4.2.1.2.1).
+    """
 
     OK = "ok"
     DISCARD = "discard"
+    EARLY_RETURN = "early_return"
     TERMINATED = "terminated"
+
+
+class StateVerdict(StrEnum):
+    """What a test of saved states showed.
+
+    ``EXACT``: bit for bit as without. ``RESTARTS_SOLVER``: steps after a restore repeat, but differ
+    from those without, because the model's solver starts anew. ``DOES_NOT_REPEAT``: steps after a
+    restore differ from each other. ``BROKEN``: a call failed. ``NOT_TESTED``: no state is saved.
+    """
+
+    EXACT = "exact"
+    RESTARTS_SOLVER = "restarts solver"
+    DOES_NOT_REPEAT = "does not repeat"
+    BROKEN = "broken"
+    NOT_TESTED = "not tested"
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """What trial steps of a slave showed; it stands where it stood before, if its states are exact.
+
+    Attributes:
+        state_verdict: whether its saved states can be trusted.
+        state_reason: what was seen, in words.
+        difference: largest relative difference of an output after a restore, from the same step
+            without one.
+        internal_clock: the outputs move only at multiples of this [s]; None: no such clock.
+        step_dependence: how much a step of 2h differs from two of h, weighted by the tolerance:
+            far above 1 if the model takes one step of its own in each do_step.
+        largest_substep: steps of the model up to this keep that difference within the tolerance
+            [s]; None: there is no need.
+    """
+
+    state_verdict: StateVerdict = StateVerdict.NOT_TESTED
+    state_reason: str = ""
+    difference: float = 0.0
+    internal_clock: float | None = None
+    step_dependence: float = 0.0
+    largest_substep: float | None = None
 
 
 class Slave(ABC):
@@ -137,6 +281,9 @@ class Slave(ABC):
     or a discarded step only ``set_state``, ``reset`` and ``terminate`` are meaningful.
     Saved states are opaque to the caller; what ``get_state`` returned stays valid until it is
     passed to ``free_state`` or the slave is reset, and may be restored any number of times.
+
+    Continuous Real variables that are connected go through ``set_inputs`` and ``get_outputs``, all
+    others through ``set_discrete_inputs`` and ``get_discrete_outputs``.
     """
 
     description: SlaveDescription
@@ -151,10 +298,15 @@ class Slave(ABC):
         start_values: Mapping[str, StartValue],
         inputs: Sequence[str],
         outputs: Sequence[str],
+        discrete_inputs: Sequence[str] = (),
+        discrete_outputs: Sequence[str] = (),
+        early_return: bool = False,
     ) -> None:
         """Set up the experiment, set start values, enter initialization mode.
 
-        ``inputs`` and ``outputs`` fix the order of the columns of all arrays that follow.
+        ``inputs`` and ``outputs`` fix the order of the columns of all arrays that follow,
+        ``discrete_inputs`` and ``discrete_outputs`` that of the values of other types.
+        ``early_return``: do_step may end at an event within the step, with ``EARLY_RETURN``.
         """
 
     @abstractmethod
@@ -179,6 +331,15 @@ class Slave(ABC):
     def get_outputs(self, order: int) -> FloatArray:
         """Outputs and their derivatives up to ``order``: shape (order + 1, n_y), [y]/s^j."""
 
+    def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
+        """Set the discrete inputs from here on, one value for each."""
+        if values:
+            raise SlaveError(f"{self.description.model} has no discrete inputs")
+
+    def get_discrete_outputs(self) -> tuple[StartValue, ...]:
+        """The discrete outputs, one value for each."""
+        return ()
+
     @abstractmethod
     def get_state(self) -> object:
         """Save the state."""
@@ -186,6 +347,11 @@ class Slave(ABC):
     @abstractmethod
     def set_state(self, state: object) -> None:
         """Go back to a saved state."""
+
+    def set_state_and_free(self, state: object) -> None:
+        """Go back to a saved state and give it up with that."""
+        self.set_state(state)
+        self.free_state(state)
 
     @abstractmethod
     def free_state(self, state: object) -> None:
@@ -210,6 +376,18 @@ class Slave(ABC):
     @abstractmethod
     def close(self) -> None:
         """Free the instance and all that belongs to it. Idempotent."""
+
+
+def refuse_discrete(
+    description: SlaveDescription, inputs: Sequence[str], outputs: Sequence[str]
+) -> None:
+    """For a slave that has no discrete variables.
+
+    Raises:
+        SlaveError: some were asked for.
+    """
+    if inputs or outputs:
+        raise SlaveError(f"{description.model} has no discrete variables {[*inputs, *outputs]}")
 
 
 class CallExecutor(Protocol):

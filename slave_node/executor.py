@@ -9,17 +9,21 @@ from typing import Any
 
 from protocol.calls import (
     Call,
+    Configure,
     Describe,
     DeserializeState,
     DoStep,
+    Examine,
     ExitInitializationMode,
     FreeState,
+    GetDiscreteOutputs,
     GetOutputs,
     GetState,
     Initialize,
     Reply,
     Reset,
     SerializeState,
+    SetDiscreteInputs,
     SetInputs,
     SetState,
     StepResult,
@@ -28,9 +32,13 @@ from protocol.calls import (
 from protocol.errors import DoublestepError, FatalSlaveError, LifeCycleError, SlaveError
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState, refusal
 from protocol.slave import Slave, SlaveDescription, StepStatus
+from slave_node.examination import examine
 from slave_node.snapshots import SnapshotStore
 
 _OK = StepStatus.OK
+
+Load = Callable[[Configure], Slave]
+"""Loads the model in a configuration; raises `ModelError`."""
 
 
 class _Mode:
@@ -48,35 +56,50 @@ class Executor:
 
     Whatever goes wrong in the slave becomes the reply's error, with the call named; the life
     cycle then says what is still possible. Single-threaded.
+
+    Args:
+        slave: instantiated.
+        load: loads the same model in another configuration; None: it has only this one.
     """
 
-    def __init__(self, slave: Slave) -> None:
+    def __init__(self, slave: Slave, load: Load | None = None) -> None:
+        self._load = load
+        self._configuration = Configure()
+        self._modes = {state: _Mode(state) for state in LifeCycleState}
+        self._mode = self._modes[LifeCycleState.INSTANTIATED]
+        self._bind(slave)
+
+    def _bind(self, slave: Slave) -> None:
+        """Run calls on this slave from here on."""
         self._slave = slave
+        self._is_loaded = True
         self._snapshots = SnapshotStore(slave)
         save, restore = self._snapshots.save, self._snapshots.restore
         set_inputs, do_step, get_outputs = slave.set_inputs, slave.do_step, slave.get_outputs
         run: Mapping[type[Call], Callable[[Any], object]] = {
             Describe: lambda _: slave.description,
+            Configure: self._configure,
             Initialize: self._initialize,
             ExitInitializationMode: lambda _: slave.exit_initialization_mode(),
+            Examine: lambda call: examine(slave, call.communication_point, call.step_size),
             SetInputs: lambda call: set_inputs(call.derivatives),
+            SetDiscreteInputs: lambda call: slave.set_discrete_inputs(call.values),
             DoStep: lambda call: do_step(
                 call.communication_point, call.step_size, call.no_set_state_prior
             ),
             GetOutputs: lambda call: get_outputs(call.order),
+            GetDiscreteOutputs: lambda _: slave.get_discrete_outputs(),
             GetState: lambda call: save(call.state),
-            SetState: lambda call: restore(call.state),
+            SetState: lambda call: restore(call.state, free=call.free),
             FreeState: lambda call: self._snapshots.free(call.state),
             SerializeState: lambda call: self._snapshots.serialize(call.state),
             DeserializeState: lambda call: self._snapshots.deserialize(call.state, call.data),
             Terminate: lambda _: slave.terminate(),
             Reset: self._reset,
         }
-        self._modes = {state: _Mode(state) for state in LifeCycleState}
         for state, following in LIFE_CYCLE.items():
             for kind, after in following.items():
                 self._modes[state].allowed[kind] = (run[kind], self._modes[after])
-        self._mode = self._modes[LifeCycleState.INSTANTIATED]
 
     @property
     def description(self) -> SlaveDescription:
@@ -136,11 +159,23 @@ class Executor:
             error.__cause__ = exception
         if isinstance(call, DoStep):
             error.located(time=call.communication_point, step_size=call.step_size)
-        if isinstance(error, FatalSlaveError):
+        if isinstance(error, FatalSlaveError) or not self._is_loaded:
             self._mode = self._modes[LifeCycleState.FATAL]
         elif not isinstance(error, LifeCycleError):
             self._mode = self._modes[LifeCycleState.ERROR]
         return error.located(phase=call.verb)
+
+    def _configure(self, call: Configure) -> SlaveDescription:
+        """Replace the slave by one that is loaded as the call says."""
+        if call != self._configuration:
+            if self._load is None:
+                raise SlaveError(f"{self._slave.description.model} cannot be configured")
+            self._snapshots.clear()
+            self._slave.close()
+            self._is_loaded = False
+            self._bind(self._load(call))
+            self._configuration = call
+        return self._slave.description
 
     def _initialize(self, call: Initialize) -> None:
         self._slave.initialize(
@@ -150,6 +185,9 @@ class Executor:
             start_values=call.start_values,
             inputs=call.inputs,
             outputs=call.outputs,
+            discrete_inputs=call.discrete_inputs,
+            discrete_outputs=call.discrete_outputs,
+            early_return=call.early_return,
         )
 
     def _reset(self, _: Reset) -> None:

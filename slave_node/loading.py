@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 
+from protocol.calls import Configure
 from protocol.errors import ModelError
 from protocol.slave import CallExecutor, Slave, SlaveDescription
 from slave_node.executor import Executor
 from slave_node.model import Model, describe
 from slave_node.model_loading import load_model_class
 
+DEFAULT = Configure()
 
-def load_slave(model: str, base: Path, name: str, scratch: Path, *, log_all: bool = False) -> Slave:
+
+def load_slave(
+    model: str,
+    base: Path,
+    name: str,
+    scratch: Path,
+    *,
+    log_all: bool = False,
+    configuration: Configure = DEFAULT,
+) -> Slave:
     """The slave for ``model``.
 
     Args:
@@ -21,17 +33,23 @@ def load_slave(model: str, base: Path, name: str, scratch: Path, *, log_all: boo
         name: instance name.
         scratch: an existing empty directory to extract into; the caller removes it after close.
         log_all: let an FMU log all its categories.
+        configuration: as it is to be run.
 
     Raises:
-        ModelError: the model is missing, unusable, or not for this platform.
+        ModelError: the model is missing, unusable, not for this platform, or cannot be run so.
     """
     if _is_fmu(model):
         from slave_node.fmu.fmi2 import Fmi2Slave  # noqa: PLC0415  a Python model needs no fmpy
 
-        return Fmi2Slave((base / model).resolve(), scratch, name, log_all=log_all)
-    from slave_node.model_slave import ModelSlave  # noqa: PLC0415  and an FMU no scipy
+        slave: Slave = Fmi2Slave((base / model).resolve(), scratch, name, log_all=log_all)
+    else:
+        from slave_node.model_slave import ModelSlave  # noqa: PLC0415  and an FMU no scipy
 
-    return ModelSlave(_model_class(model, base))
+        slave = ModelSlave(_model_class(model, base))
+    if configuration != DEFAULT and configuration != Configure(slave.description.state_kind):
+        slave.close()
+        raise ModelError(f"{model}: cannot be run as {configuration}")
+    return slave
 
 
 def describe_model(model: str, base: Path) -> SlaveDescription:
@@ -60,6 +78,20 @@ def _model_class(model: str, base: Path) -> type[Model]:
     return load_model_class(model, base)
 
 
-def load_executor(model: str, base: Path, name: str, scratch: Path) -> CallExecutor:
-    """The same, ready to execute calls: what a master uses that runs a slave in its own process."""
-    return Executor(load_slave(model, base, name, scratch))
+def load_executor(
+    model: str, base: Path, name: str, scratch: Path, *, log_all: bool = False
+) -> CallExecutor:
+    """The same, ready to execute calls and to load the model in another configuration.
+
+    What a worker uses, and a master that runs a slave in its own process.
+    """
+    numbers = count()
+
+    def load(configuration: Configure) -> Slave:
+        directory = scratch / str(next(numbers))
+        directory.mkdir()
+        return load_slave(
+            model, base, name, directory, log_all=log_all, configuration=configuration
+        )
+
+    return Executor(load(DEFAULT), load)

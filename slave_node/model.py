@@ -33,7 +33,14 @@ import numpy as np
 from protocol.errors import ModelError
 from protocol.names import nearest
 from protocol.signals import FloatArray
-from protocol.slave import Capabilities, Causality, SlaveDescription, Variable
+from protocol.slave import (
+    Capabilities,
+    Causality,
+    InputDerivatives,
+    SlaveDescription,
+    StateKind,
+    Variable,
+)
 
 Values = FloatArray | Sequence[float]
 """What a model may return: an array, or a list or tuple of numbers."""
@@ -168,7 +175,8 @@ def describe(model: type[Model]) -> SlaveDescription:
         ),
         feed_through=dict(model.feed_through),
         initial_feed_through=dict(model.feed_through),
-        state_kind="native",
+        state_kind=StateKind.NATIVE,
+        input_derivatives=InputDerivatives.NATIVE,
     )
 
 

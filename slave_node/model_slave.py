@@ -29,7 +29,15 @@ from protocol.errors import (
 )
 from protocol.names import nearest
 from protocol.signals import MAX_ORDER, FloatArray, InputSignal
-from protocol.slave import Causality, Slave, StartValue, StepStatus, Variable, VariableType
+from protocol.slave import (
+    Causality,
+    Slave,
+    StartValue,
+    StepStatus,
+    Variable,
+    VariableType,
+    refuse_discrete,
+)
 from slave_node.model import Model, describe, error_text, real
 
 __all__ = ["Model", "ModelSlave", "ModelState", "real"]
@@ -112,6 +120,9 @@ class ModelSlave(Slave):
         start_values: Mapping[str, StartValue],
         inputs: Sequence[str],
         outputs: Sequence[str],
+        discrete_inputs: Sequence[str] = (),
+        discrete_outputs: Sequence[str] = (),
+        early_return: bool = False,  # noqa: ARG002  it never does
     ) -> None:
         """See `Slave`. Inputs that are not among ``inputs`` keep their start values.
 
@@ -122,6 +133,7 @@ class ModelSlave(Slave):
             ConfigurationError: a name that the model does not have, or a value of the wrong type.
             SlaveError: the model's ``prepare`` failed.
         """
+        refuse_discrete(self.description, discrete_inputs, discrete_outputs)
         del stop_time
         for name, value in start_values.items():
             self._start[name] = self._start_value(name, value)

@@ -30,9 +30,14 @@ class SnapshotStore:
         """
         self._put(number, self._slave.get_state)
 
-    def restore(self, number: int) -> None:
-        """Let the slave go back to the state; it stays saved."""
-        self._slave.set_state(self._get(number))
+    def restore(self, number: int, *, free: bool = False) -> None:
+        """Let the slave go back to the state; it stays saved unless ``free``."""
+        state = self._get(number)
+        if free:
+            del self._states[number]
+            self._slave.set_state_and_free(state)
+        else:
+            self._slave.set_state(state)
 
     def free(self, number: int) -> None:
         """Give the state up."""

@@ -39,7 +39,7 @@ _PR_SET_PDEATHSIG = 1
 
 @dataclass(frozen=True, slots=True)
 class ModelReference:
-    """What to load: see `slave_node.loading.load_slave`; ``parameters`` are start values that
+    """What to load: see `slave_node.loading.load_executor`; ``parameters`` are start values that
     hold unless the master gives others.
     """
 
@@ -214,17 +214,14 @@ def _main(pipe: Connection, reference: ModelReference, scratch: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
-        from slave_node.executor import Executor  # noqa: PLC0415
-        from slave_node.loading import load_slave  # noqa: PLC0415  after the process is set up
+        from slave_node.loading import load_executor  # noqa: PLC0415  after the process is set up
 
-        executor = Executor(
-            load_slave(
-                reference.model,
-                reference.base,
-                reference.name,
-                Path(scratch),
-                log_all=reference.log_all,
-            )
+        executor = load_executor(
+            reference.model,
+            reference.base,
+            reference.name,
+            Path(scratch),
+            log_all=reference.log_all,
         )
     except DoublestepError as error:
         pipe.send_bytes(encode_error(error))

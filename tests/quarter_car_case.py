@@ -36,9 +36,11 @@ from protocol.signals import InputSignal
 from protocol.slave import (
     Capabilities,
     Causality,
+    InputDerivatives,
     Slave,
     SlaveDescription,
     StartValue,
+    StateKind,
     StepStatus,
     Variable,
 )
@@ -184,7 +186,12 @@ class LinearSlave(Slave):
             capabilities=capabilities or ALL,
             feed_through=system.feed_through,
             initial_feed_through=system.feed_through,
-            state_kind="native",
+            state_kind=StateKind.NATIVE,
+            input_derivatives=(
+                InputDerivatives.NATIVE
+                if (capabilities or ALL).can_interpolate_inputs
+                else InputDerivatives.NONE
+            ),
         )
         self.saved: list[object] = []
         self.most_saved = 0
@@ -204,6 +211,9 @@ class LinearSlave(Slave):
         start_values: Mapping[str, StartValue],
         inputs: Sequence[str],
         outputs: Sequence[str],
+        discrete_inputs: Sequence[str] = (),
+        discrete_outputs: Sequence[str] = (),
+        early_return: bool = False,
     ) -> None:
         """See `Slave`."""
         assert tuple(inputs) == self.system.inputs

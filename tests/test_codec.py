@@ -19,17 +19,21 @@ from protocol import codec
 from protocol.calls import (
     CALLS,
     Call,
+    Configure,
     Describe,
     DeserializeState,
     DoStep,
+    Examine,
     ExitInitializationMode,
     FreeState,
+    GetDiscreteOutputs,
     GetOutputs,
     GetState,
     Initialize,
     Reply,
     Reset,
     SerializeState,
+    SetDiscreteInputs,
     SetInputs,
     SetState,
     StepResult,
@@ -63,8 +67,13 @@ from protocol.errors import (
 from protocol.slave import (
     Capabilities,
     Causality,
+    Examination,
+    InputDerivatives,
     SlaveDescription,
+    StateKind,
+    StateVerdict,
     StepStatus,
+    Unit,
     Variable,
     VariableType,
 )
@@ -81,7 +90,12 @@ any_float = st.one_of(
 )
 texts = st.text(st.characters(codec="utf-8"), max_size=20)
 numbers = st.integers(0, 2**63 - 1)
-start_values = st.one_of(any_float, st.integers(-(2**63), 2**63 - 1), st.booleans(), texts)
+NAMES: list[Any] = [[], [], [], [], False]
+"""The fields of `Initialize` from ``inputs`` on."""
+
+start_values = st.one_of(
+    any_float, st.integers(-(2**63), 2**64 - 1), st.booleans(), texts, st.binary(max_size=20)
+)
 
 
 def arrays() -> st.SearchStrategy[np.ndarray]:
@@ -94,19 +108,31 @@ def arrays() -> st.SearchStrategy[np.ndarray]:
 
 
 calls = st.one_of(
-    st.sampled_from([Describe(), ExitInitializationMode(), Terminate(), Reset()]),
+    st.sampled_from(
+        [Describe(), ExitInitializationMode(), GetDiscreteOutputs(), Terminate(), Reset()]
+    ),
     st.builds(
         Initialize,
         any_float,
         st.none() | any_float,
         st.none() | any_float,
         st.dictionaries(texts, start_values, max_size=3),
-        st.lists(texts, max_size=3).map(tuple),
-        st.lists(texts, max_size=3).map(tuple),
+        *[st.lists(texts, max_size=3).map(tuple)] * 4,
+        st.booleans(),
     ),
+    st.builds(
+        Configure,
+        texts,
+        st.dictionaries(texts, start_values, max_size=3),
+        st.none() | any_float,
+        numbers,
+    ),
+    st.builds(Examine, any_float, any_float, any_float, any_float),
+    st.builds(SetDiscreteInputs, st.lists(start_values, max_size=5).map(tuple)),
     st.builds(SetInputs, arrays()),
     st.builds(DoStep, any_float, any_float, st.booleans()),
-    *(st.builds(cls, numbers) for cls in (GetOutputs, GetState, SetState, FreeState)),
+    *(st.builds(cls, numbers) for cls in (GetOutputs, GetState, FreeState)),
+    st.builds(SetState, numbers, st.booleans()),
     st.builds(SerializeState, numbers),
     st.builds(DeserializeState, numbers, st.binary(max_size=50)),
 )
@@ -135,10 +161,30 @@ descriptions = st.builds(
     ),
     feed_through=names,
     initial_feed_through=names,
-    state_kind=texts,
+    state_kind=st.sampled_from(StateKind),
+    state_reason=texts,
+    input_derivatives=st.sampled_from(InputDerivatives),
+    fixed_step_size=st.none() | any_float,
+    default_step_size=st.none() | any_float,
+    units=st.dictionaries(
+        texts,
+        st.builds(Unit, st.tuples(*[st.integers(-9, 9)] * 8), factor=any_float, offset=any_float),
+        max_size=3,
+    ),
+    remarks=st.lists(texts, max_size=3).map(tuple),
     sha256=texts,
     guid=texts,
     generation_tool=texts,
+)
+
+examinations = st.builds(
+    Examination,
+    st.sampled_from(StateVerdict),
+    texts,
+    any_float,
+    st.none() | any_float,
+    any_float,
+    st.none() | any_float,
 )
 
 ERRORS = [DoublestepError]
@@ -159,7 +205,7 @@ errors = st.builds(
 )
 
 
-def results_of(call: Call) -> st.SearchStrategy[object]:
+def results_of(call: Call) -> st.SearchStrategy[object]:  # noqa: PLR0911
     """What a slave can answer to ``call``."""
     match call:
         case GetOutputs():
@@ -168,8 +214,12 @@ def results_of(call: Call) -> st.SearchStrategy[object]:
             return st.builds(StepResult, st.sampled_from(StepStatus), any_float)
         case SerializeState():
             return st.binary(max_size=50)
-        case Describe():
+        case GetDiscreteOutputs():
+            return st.lists(start_values, max_size=5).map(tuple)
+        case Describe() | Configure():
             return descriptions
+        case Examine():
+            return examinations
         case _:
             return st.none()
 
@@ -222,6 +272,10 @@ def test_the_examples_cover_every_call() -> None:
     """No call was added without the round trips above learning of it."""
     assert set(CALLS) == {
         Describe,
+        Configure,
+        Examine,
+        SetDiscreteInputs,
+        GetDiscreteOutputs,
         Initialize,
         ExitInitializationMode,
         SetInputs,
@@ -488,12 +542,30 @@ def program(shape: Any, numbers: bytes = b"") -> bytes:
         (program([["set_inputs", 2, 3]], bytes(56)), "where its shape wants 48"),
         (program([["set_inputs", 4, 200_000]]), "where its shape wants 6400000"),
         (program([], bytes(8)), "where its shape wants 0"),
-        (program([["initialize", "0", None, None, {}, [], []]]), "start_time must be a number"),
-        (program([["initialize", True, None, None, {}, [], []]]), "must be a number, not True"),
-        (program([["initialize", 0, None, None, {"m": [1]}, [], []]]), "string, not a list"),
-        (program([["initialize", 0, None, None, [], [], []]]), "must be a map by name"),
-        (program([["initialize", 0, None, None, {}, [3], []]]), "inputs must be a string"),
-        (program([["initialize", 0, None, None, {}, "xy", []]]), "must be a list of strings"),
+        (
+            program([["initialize", "0", None, None, {}, *NAMES]]),
+            "start_time must be a number",
+        ),
+        (
+            program([["initialize", True, None, None, {}, *NAMES]]),
+            "must be a number, not True",
+        ),
+        (
+            program([["initialize", 0, None, None, {"m": [1]}, *NAMES]]),
+            "string or bytes, not a list",
+        ),
+        (
+            program([["initialize", 0, None, None, [], *NAMES]]),
+            "must be a map by name",
+        ),
+        (
+            program([["initialize", 0, None, None, {}, [3], *NAMES[1:]]]),
+            "inputs must be a string",
+        ),
+        (
+            program([["initialize", 0, None, None, {}, "xy", *NAMES[1:]]]),
+            "must be a list of strings",
+        ),
         (program([["reset"]] * (MAX_CALLS + 1)), f"at most {MAX_CALLS} calls"),
         (program({"reset": 1}), "a program must be a list"),
         (program([msgpack.ExtType(4, b"")]), "a call must be"),

@@ -14,9 +14,11 @@ from master_node import Result, System
 from protocol.calls import StepResult
 from protocol.slave import (
     Causality,
+    InputDerivatives,
     Slave,
     SlaveDescription,
     StartValue,
+    StateKind,
     StepStatus,
     Variable,
 )
@@ -44,7 +46,8 @@ class JumpingSource(Slave):
             kind="test",
             variables=(Variable("y", Causality.OUTPUT),),
             capabilities=replace(ALL, max_output_derivative_order=1),
-            state_kind="native",
+            state_kind=StateKind.NATIVE,
+            input_derivatives=InputDerivatives.NATIVE,
         )
         self.reset()
 
@@ -61,6 +64,9 @@ class JumpingSource(Slave):
         start_values: Mapping[str, StartValue],
         inputs: Sequence[str],
         outputs: Sequence[str],
+        discrete_inputs: Sequence[str] = (),
+        discrete_outputs: Sequence[str] = (),
+        early_return: bool = False,
     ) -> None:
         """See `Slave`."""
         self.time = start_time

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,16 +15,20 @@ from hypothesis import strategies as st
 from protocol.calls import (
     CALLS,
     Call,
+    Configure,
     Describe,
     DeserializeState,
     DoStep,
+    Examine,
     ExitInitializationMode,
     FreeState,
+    GetDiscreteOutputs,
     GetOutputs,
     GetState,
     Initialize,
     Reset,
     SerializeState,
+    SetDiscreteInputs,
     SetInputs,
     SetState,
     StepResult,
@@ -82,6 +87,9 @@ class Recorder(Slave):
         start_values: Mapping[str, StartValue],
         inputs: Sequence[str],
         outputs: Sequence[str],
+        discrete_inputs: Sequence[str] = (),
+        discrete_outputs: Sequence[str] = (),
+        early_return: bool = False,
     ) -> None:
         self._hear("initialize")
 
@@ -100,6 +108,13 @@ class Recorder(Slave):
     def get_outputs(self, order: int) -> FloatArray:
         self._hear("get_outputs")
         return np.zeros((order + 1, 0))
+
+    def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
+        self._hear("set_discrete_inputs")
+
+    def get_discrete_outputs(self) -> tuple[StartValue, ...]:
+        self._hear("get_discrete_outputs")
+        return ()
 
     def get_state(self) -> object:
         return self._make("get_state")
@@ -134,8 +149,12 @@ EXAMPLES: dict[type[Call], Call] = {
     type(call): call
     for call in (
         Describe(),
+        Configure(),
         Initialize(),
         ExitInitializationMode(),
+        Examine(0.5, 0.25),
+        SetDiscreteInputs((1,)),
+        GetDiscreteOutputs(),
         SetInputs(np.zeros((1, 0))),
         STEP,
         GetOutputs(),
@@ -194,7 +213,8 @@ def test_every_call_in_every_state(state: LifeCycleState, kind: type[Call]) -> N
         assert reply.error is None
         assert len(reply.results) == 1
         assert executor.state is following
-        assert slave.heard[heard:] == ([] if kind is Describe else [kind.verb]) or kind is Reset
+        unheard = kind in (Describe, Configure, Examine)  # nothing to configure or to examine
+        assert slave.heard[heard:] == ([] if unheard else [kind.verb]) or kind is Reset
     else:
         assert type(reply.error) is LifeCycleError
         assert reply.error.phase == kind.verb
@@ -215,10 +235,59 @@ def test_the_table_speaks_of_every_state_and_only_of_calls() -> None:
             assert allowed[Reset] is LifeCycleState.INSTANTIATED
 
 
+# ---- Configurations ----------------------------------------------------------------------------
+
+
+def test_another_configuration_is_another_slave() -> None:
+    """The model is loaded anew, once, and the slave before it closed; the same again is no call."""
+    slaves: list[Recorder] = []
+
+    def load(configuration: Configure) -> Recorder:
+        slaves.append(Recorder())
+        slaves[-1].description = replace(Recorder.description, model=configuration.state_kind)
+        return slaves[-1]
+
+    executor = Executor(first := Recorder(), load)
+    for _ in range(2):
+        reply = executor.execute([Configure("replay"), Initialize()])
+        assert reply.error is None
+        assert reply.results[0] is executor.description
+        executor.execute([Reset()])
+    assert executor.description.model == "replay"
+    assert first.heard == ["close"]
+    assert [slave.heard for slave in slaves] == [["initialize", "reset"] * 2]
+
+
+def test_a_slave_that_cannot_be_loaded_again_is_gone() -> None:
+    """Its error is told, nothing but `Describe` is possible, and it is closed only once."""
+
+    def load(_: Configure) -> Slave:
+        raise ModelError("no licence")
+
+    executor = Executor(slave := Recorder(), load)
+    reply = executor.execute([Configure("fork")])
+    assert type(reply.error) is ModelError
+    assert reply.error.phase == "configure"
+    assert executor.state is LifeCycleState.FATAL
+    executor.close()
+    assert slave.heard == ["close"]
+
+
+def test_a_state_can_be_freed_with_its_restoring() -> None:
+    """After that it is not there any more, and was freed once."""
+    executor, slave = standing_in(LifeCycleState.STEP_COMPLETE)
+    assert executor.execute([SetState(1, free=True)]).error is None
+    assert slave.heard[-2:] == ["set_state", "free_state"]
+    assert executor.saved_states == 0
+    assert not slave.live
+    assert isinstance(executor.execute([SetState(1)]).error, SlaveError)
+    assert not slave.misused
+
+
 # ---- Besides the table -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("status", [StepStatus.DISCARD, StepStatus.TERMINATED])
+@pytest.mark.parametrize("status", [status for status in StepStatus if status is not StepStatus.OK])
 def test_a_step_that_is_not_ok_ends_the_program(status: StepStatus) -> None:
     """Its result is the last one and no error; the next calls are not made."""
     executor, slave = standing_in(LifeCycleState.STEP_COMPLETE)

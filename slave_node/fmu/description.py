@@ -13,8 +13,10 @@ from protocol.errors import ModelError
 from protocol.slave import (
     Capabilities,
     Causality,
+    InputDerivatives,
     SlaveDescription,
     StartValue,
+    StateKind,
     Variable,
     VariableType,
 )
@@ -85,7 +87,10 @@ def _described(fmu: Path, model_description: Any) -> SlaveDescription:
         feed_through=feed_through,
         initial_feed_through=feed_through
         | _feed_through(model_description, model_description.initialUnknowns, inputs, listed=True),
-        state_kind="native" if slave.canGetAndSetFMUstate else "none",
+        state_kind=StateKind.NATIVE if slave.canGetAndSetFMUstate else StateKind.NONE,
+        input_derivatives=(
+            InputDerivatives.NATIVE if slave.canInterpolateInputs else InputDerivatives.NONE
+        ),
         sha256=hashlib.sha256(fmu.read_bytes()).hexdigest(),
         guid=model_description.guid or "",
         generation_tool=model_description.generationTool or "",

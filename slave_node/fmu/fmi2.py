@@ -37,6 +37,7 @@ from protocol.slave import (
     StepStatus,
     Variable,
     VariableType,
+    refuse_discrete,
 )
 from slave_node.fmu.archive import check_binary, extract
 from slave_node.fmu.description import describe, read_description
@@ -196,9 +197,13 @@ class Fmi2Slave(Slave):
         start_values: Mapping[str, StartValue],
         inputs: Sequence[str],
         outputs: Sequence[str],
+        discrete_inputs: Sequence[str] = (),
+        discrete_outputs: Sequence[str] = (),
+        early_return: bool = False,  # noqa: ARG002  it never does
     ) -> None:
         """See `Slave`."""
         assert self._fmu is not None
+        refuse_discrete(self.description, discrete_inputs, discrete_outputs)
         self._bind(inputs, outputs)
         try:
             self._fmu.setupExperiment(
