@@ -95,7 +95,7 @@ class CoSimulation:
         """
         settings = self.system.simulation
         scheme = CouplingScheme.of(self.coupled, self.system)
-        y = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
+        y = initialize(self.group, self.coupled, self.system, scheme.get_outputs).y
         self.group.restart_statistics()
         statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
         self.observer.started(

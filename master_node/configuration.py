@@ -51,7 +51,9 @@ Number = Annotated[StrictFloat, AfterValidator(_finite)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Reference = Annotated[StrictStr, AfterValidator(_reference)]
-Value = StrictBool | StrictInt | StrictFloat | StrictStr
+Scalar = StrictBool | StrictInt | StrictFloat | StrictStr
+Value = Scalar | tuple[Scalar, ...] | tuple[tuple[Scalar, ...], ...]
+"""A value, or those of an array with one or two dimensions."""
 
 
 class _Table(BaseModel):
@@ -299,12 +301,20 @@ class SlaveSettings(_Table):
 
 
 class Connection(_Table):
-    """A ``[[connections]]`` table: ``from = "slave.output"``, ``to = "slave.input"``."""
+    """A ``[[connections]]`` table: ``from = "slave.output"``, ``to = "slave.input"``.
+
+    Attributes:
+        factor, offset: input = factor * output + offset, in place of a conversion of units.
+        ignore_units: hand the value on as it is, whatever the units.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     source: Reference = Field(alias="from")
     target: Reference = Field(alias="to")
+    factor: Number | None = None
+    offset: Number | None = None
+    ignore_units: StrictBool = False
 
     @model_validator(mode="before")
     @classmethod
@@ -451,7 +461,7 @@ def _sentence(detail: ErrorDetails) -> str:
     message = _WORDS.get(kind, detail["msg"].removeprefix("Value error, "))
     message = message[:1].lower() + message[1:]
     if len(place) > 2 and place[2] == "parameters":
-        message = "must be a number, a boolean or a string"
+        message = "must be a number, a boolean, a string or an array of them"
     if not place:
         return message
     if kind == "value_error" and len(place) == 1:
@@ -489,5 +499,5 @@ def _known_keys(place: list[str]) -> list[str]:
         case ["slaves", _, "tolerances", _]:
             model = OutputTolerance
         case ["connections", _]:
-            return ["from", "to"]
+            return ["from", "to", "factor", "offset", "ignore_units"]
     return [name for name in model.model_fields if name not in ("base", "source")]

@@ -88,7 +88,7 @@ class ControlledRun:
         settings, coupled, scheme = context.system.simulation, context.coupled, context.scheme
         self._settings = settings
         self._start = float(settings.start_time)
-        self._source = coupled.source
+        self._coupled = coupled
         self._scheme = scheme
         self._observer = context.observer
         self._statistics = context.statistics
@@ -155,7 +155,7 @@ class ControlledRun:
     # --- beginnings -----------------------------------------------------------------------------
 
     def _first_position(self, y: FloatArray) -> _Position:
-        settings, u = self._settings, y[:, self._source]
+        settings, u = self._settings, self._coupled.inputs_of(y)
         points = settings.polynomial.order + 1  # an input without a derivative needs them all
         depth = self._estimator.points(points) + self._scheme.known_ahead
         depth = max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
@@ -241,7 +241,7 @@ class ControlledRun:
     ) -> _Position:
         self._stepper.accepted()
         times, polynomials = step.times, step.polynomials
-        history = step.history.pushed(times.end, step.end.take(self._source, axis=1))
+        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
         reached: Reached = ((times.middle, step.middle), (times.end, step.end))
         order = max(polynomial.order for polynomial in polynomials)
         self._tell_accepted(step, error, reached, self._results.reached(reached, order))
@@ -372,7 +372,7 @@ class ControlledRun:
         reached: Reached = ((times.middle, step.middle), (times.end, step.end))
         error = error._replace(limiting_variable=name if name == "event" else f"{name} jumps")
         self._tell_accepted(step, error, reached, self._results.jumped(reached))
-        history = step.history.pushed(times.end, step.end.take(self._source, axis=1)).cut()
+        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end)).cut()
         behind = _Position(history, step.end, position.step_size, self._restarted_order())
         if times.end >= self._settings.end:
             return behind

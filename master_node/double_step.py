@@ -79,7 +79,7 @@ class DoubleStepper:
         scheme: CouplingScheme,
         estimator: ErrorEstimator,
     ) -> None:
-        self._source = coupled.source
+        self._coupled = coupled
         self._scheme = scheme
         self._is_long_step = estimator.comparison is Comparison.LONG_STEP
         self._requests = StepRequests(group, coupled, scheme)
@@ -152,7 +152,7 @@ class DoubleStepper:
             y_middle, comparison = self._requests.take([small_piece, comparison_piece])
             before_second = (RESTORE_HALFWAY,)
 
-        pushed = history.pushed(middle, y_middle.take(self._source, axis=1))
+        pushed = history.pushed(middle, self._coupled.inputs_of(y_middle))
         second_piece = Piece(
             before_second,
             inputs_of("second", pushed, end),
@@ -176,5 +176,5 @@ class DoubleStepper:
         """Around the newest point of ``history``, with what is ``known`` at the later ``time``."""
         ahead = self._scheme.known_ahead
         if ahead:
-            history = history.pushed(time, known[:, self._source])
+            history = history.pushed(time, self._coupled.inputs_of(known))
         return self._scheme.extrapolation.signal(history, polynomials, ahead)

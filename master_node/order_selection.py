@@ -96,7 +96,11 @@ class OrderSelection:
         outputs = len(coupled.output_names)
         squares = np.bincount(coupled.output_slave, np.square(error.estimate * weights), slaves)
         magnitudes = input_magnitudes(
-            history, self._has_derivative, weights[coupled.source], self._slave_of_input, slaves
+            history,
+            self._has_derivative,
+            coupled.weights_of_inputs(weights),
+            self._slave_of_input,
+            slaves,
         )
         begin, middle, end, step_size, _ = step.times
         nodes = self._control.nodes(step)

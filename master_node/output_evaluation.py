@@ -33,7 +33,7 @@ class OutputEvaluation:
 
     def __init__(self, group: SlaveGroup, coupled: CoupledSystem, scheme: CouplingScheme) -> None:
         self._group = group
-        self._source = coupled.source
+        self._coupled = coupled
         self._slaves = scheme.evaluated
         self._parts = [coupled.parts[slave] for slave in self._slaves]
         order = coupled.at_point
@@ -82,7 +82,7 @@ class OutputEvaluation:
             ) from None
 
     def _round(self, y: FloatArray, time: float, step_size: float) -> FloatArray:
-        u = y[self._source]
+        u = self._coupled.inputs_of(y)
         programs: list[Program] = [
             (SetInputs(u[np.newaxis, part.input_slice]), _GET_OUTPUTS) for part in self._parts
         ]
