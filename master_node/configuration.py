@@ -299,12 +299,21 @@ class SlaveSettings(_Table):
 
 
 class Connection(_Table):
-    """A ``[[connections]]`` table: ``from = "slave.output"``, ``to = "slave.input"``."""
+    """A ``[[connections]]`` table: ``from = "slave.output"``, ``to = "slave.input"``.
+
+    Attributes:
+        factor, offset: input = factor * output + offset; where one of them is given they are the
+            whole transformation, and units are not converted.
+        ignore_units: take the number as it is, whatever the units are.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     source: Reference = Field(alias="from")
     target: Reference = Field(alias="to")
+    factor: Number | None = None
+    offset: Number | None = None
+    ignore_units: StrictBool = False
 
     @model_validator(mode="before")
     @classmethod
@@ -489,5 +498,5 @@ def _known_keys(place: list[str]) -> list[str]:
         case ["slaves", _, "tolerances", _]:
             model = OutputTolerance
         case ["connections", _]:
-            return ["from", "to"]
+            return [field.alias or name for name, field in Connection.model_fields.items()]
     return [name for name in model.model_fields if name not in ("base", "source")]
