@@ -23,12 +23,13 @@ from master_node.ssp.structure import (
     Parameter,
     SystemElement,
     Unit,
+    Value,
     listed,
 )
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.keys import check_name
 from protocol.names import nearest
-from protocol.slave import SlaveDescription, StartValue
+from protocol.slave import SlaveDescription
 
 Describe = Callable[[Path], SlaveDescription]
 
@@ -49,7 +50,7 @@ class Slave:
 
     name: str
     model: Path
-    parameters: Mapping[str, StartValue]
+    parameters: Mapping[str, Value]
 
 
 def flatten(
@@ -92,7 +93,7 @@ class _Flattening:
         self._systems = dict(_systems((), root))
         self.components: dict[_Path, Component] = dict(_in_document_order((), root))
         self.names = _slave_names(self.components, notes)
-        self.parameters: dict[_Path, dict[str, StartValue]] = {p: {} for p in self.components}
+        self.parameters: dict[_Path, dict[str, Value]] = {p: {} for p in self.components}
         self._incoming: dict[_Port, _Edge] = {}
         self._outgoing: dict[_Port, list[_Edge]] = {}
         self._given: set[_Port] = set()

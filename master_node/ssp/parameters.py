@@ -13,6 +13,7 @@ from master_node.ssp.structure import (
     Table,
     Transformation,
     Unsupported,
+    Value,
     listed,
 )
 from master_node.ssp.xml_nodes import Node, boolean, integer, number
@@ -180,7 +181,7 @@ def _parameter(node: Node, enumerations: Mapping[str, Mapping[str, int]]) -> Par
         raise node.error("needs one element with its type and value")
     (kind,) = types
     problem, unit = "", ""
-    value: float | int | bool | str = 0
+    value: Value = 0
     if node.children("ssv:Dimension", "ssc:Dimension"):
         problem = "an array"
         kind.attribute("value")

@@ -56,7 +56,6 @@ _TYPES = tuple(
         "Binary",
     )
 )
-_NOT_CONNECTED = ("ssc:Binary", "ssc:String")
 _KINDS = {
     *("input", "output", "parameter", "calculatedParameter", "inout"),
     *("structuralParameter", "constant", "local", "unspecified"),
@@ -353,7 +352,7 @@ class _Document:
         if len(types) > 1:
             raise types[1].error("is a second type")
         for child in types:
-            if child.name in _NOT_CONNECTED:
+            if child.name == "ssc:Binary":
                 problem = f"type {child.name}"
             name = child.attribute("unit")
             if name and name not in self.units:

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from protocol.errors import ConfigurationError
-from protocol.slave import StartValue
+
+Value = float | int | bool | str
+"""Of a parameter; an enumeration's is its number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +119,12 @@ class Parameter:
     """
 
     name: str
-    value: StartValue
+    value: Value
     unit: str
     problem: str
     place: str
 
-    def usable(self) -> StartValue:
+    def usable(self) -> Value:
         """The value.
 
         Raises:

@@ -19,15 +19,23 @@ from master_node.ssp.reading import (
     SETTINGS_ELEMENT,
     SSV_TYPE,
 )
+from master_node.ssp.structure import Value
 from master_node.ssp.xml_nodes import NAMESPACES
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
-from protocol.slave import SlaveDescription, StartValue, VariableType
+from protocol.slave import SlaveDescription, VariableType
 
 _Describe = Callable[[str, Path], SlaveDescription]
 _SSD, _SSC, _SSV = (f"{{{NAMESPACES[prefix]}}}" for prefix in ("ssd", "ssc", "ssv"))
 _TIME = (1980, 1, 1, 0, 0, 0)
 """Of all entries, so that equal systems give equal packages."""
+
+_TYPES = {
+    **dict.fromkeys(("Real", "Float32", "Float64"), "Real"),
+    **dict.fromkeys(("Integer", "Int8", "UInt8", "Int16", "UInt16", "Int32"), "Integer"),
+    **{name: name for name in ("Boolean", "String", "Binary")},
+}
+"""What SSP 1.0 calls the types of variables, as far as it has them."""
 
 _SMALLEST_INTEGER, _LARGEST_INTEGER = -(2**31), 2**31 - 1
 
@@ -134,8 +142,8 @@ def _add_connectors(
         connector = etree.SubElement(connectors, f"{_SSD}Connector", name=name, kind=kind)
         # An enumeration would have to be defined here, and a unit as well: without them those of
         # the FMU hold.
-        type_ = description.variable(name).type
-        if type_ is not VariableType.ENUMERATION:
+        type_ = _TYPES.get(description.variable(name).type)
+        if type_ is not None:
             etree.SubElement(connector, f"{_SSC}{type_}")
 
 
@@ -222,7 +230,7 @@ def _parameter_set(
     return _text(root)
 
 
-def _value(value: StartValue, type_: VariableType, where: str) -> tuple[str, str]:
+def _value(value: Value, type_: VariableType, where: str) -> tuple[str, str]:
     """The SSV type and text of a start value."""
     if isinstance(value, bool):
         return "Boolean", "true" if value else "false"
@@ -230,7 +238,7 @@ def _value(value: StartValue, type_: VariableType, where: str) -> tuple[str, str
         return "String", value
     if not math.isfinite(value):
         raise ConfigurationError(f"{where} = {value}: is not a finite number")
-    if isinstance(value, float) or type_ is VariableType.REAL:
+    if isinstance(value, float) or _TYPES.get(type_) == "Real":
         return "Real", repr(float(value))
     if not _SMALLEST_INTEGER <= value <= _LARGEST_INTEGER:
         raise ConfigurationError(f"{where} = {value}: has more than 32 bits")
