@@ -19,7 +19,6 @@ from master_node.ssp.reading import (
     SETTINGS_ELEMENT,
     SSV_TYPE,
 )
-from master_node.ssp.structure import Value
 from master_node.ssp.xml_nodes import NAMESPACES
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
@@ -230,12 +229,14 @@ def _parameter_set(
     return _text(root)
 
 
-def _value(value: Value, type_: VariableType, where: str) -> tuple[str, str]:
+def _value(value: object, type_: VariableType, where: str) -> tuple[str, str]:
     """The SSV type and text of a start value."""
     if isinstance(value, bool):
         return "Boolean", "true" if value else "false"
     if isinstance(value, str):
         return "String", value
+    if not isinstance(value, int | float):
+        raise ConfigurationError(f"{where} = {value!r:.60}: SSP 1.0 has no such value")
     if not math.isfinite(value):
         raise ConfigurationError(f"{where} = {value}: is not a finite number")
     if isinstance(value, float) or _TYPES.get(type_) == "Real":
