@@ -10,6 +10,7 @@ from master_node.configuration import (
 )
 from master_node.results import Result
 from master_node.simulation import simulate
+from master_node.system_files import open_system
 
 __all__ = [
     "BusSettings",
@@ -19,5 +20,6 @@ __all__ = [
     "SlaveSettings",
     "System",
     "load_system",
+    "open_system",
     "simulate",
 ]

@@ -499,5 +499,5 @@ def _known_keys(place: list[str]) -> list[str]:
         case ["slaves", _, "tolerances", _]:
             model = OutputTolerance
         case ["connections", _]:
-            return ["from", "to", "factor", "offset", "ignore_units"]
+            return [field.alias or name for name, field in Connection.model_fields.items()]
     return [name for name in model.model_fields if name not in ("base", "source")]

@@ -360,8 +360,8 @@ def test_a_missing_stop_time_may_come_later_but_must_come(tmp_path: Path) -> Non
             "[slaves.wheel.tolerances.x] unknown key 'relativ'; did you mean 'relative'?",
         ),
         (
-            f"{SYSTEM}\nunit = 1",
-            "[[connections]] number 2: unknown key 'unit'; did you mean 'ignore_units'?",
+            f"{SYSTEM}\nfactr = 1",
+            "[[connections]] number 2: unknown key 'factr'; did you mean 'factor'?",
         ),
         (bus("conect = []"), "[bus] unknown key 'conect'; did you mean 'connect'?"),
     ],
