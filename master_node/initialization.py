@@ -2,6 +2,7 @@
 
 Outputs that depend on no connected input in initialization mode are right at once; those that
 depend on them only after these were handed on, and so on, level by level (feed-through order).
+External inputs have their values at T_0 from the beginning.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from master_node.configuration import System
 from master_node.numerics.fixed_point import NoFixedPointError, fixed_point
 from master_node.slave_group import Program, SlaveGroup
-from master_node.system import CoupledSystem
+from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import ExitInitializationMode, GetOutputs, Initialize, Reply, SetInputs
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
@@ -89,29 +90,44 @@ def _initialize(slave: str, coupled: CoupledSystem, system: System) -> Program:
 def _propagate(group: SlaveGroup, coupled: CoupledSystem, start: float) -> FloatArray:
     """Y in initialization mode after enough rounds for every level to have settled."""
     starts = np.concatenate([part.input_starts for part in coupled.parts])
-    replies = group.execute_all([(GetOutputs(),) for _ in coupled.parts], start)
+    external = coupled.external.at(start)[np.newaxis]
+    replies = group.execute_all(
+        [_first_outputs(part, starts, external) for part in coupled.parts], start
+    )
     y: FloatArray = gather(coupled, replies, -1)[0]
     if coupled.initialization.loop:
-        return _iterate(group, coupled, start, y)
+        return _iterate(group, coupled, external, start, y)
     for level in range(int(coupled.initialization.levels.max()) + 1):
         known = coupled.initialization.levels[coupled.source] <= level
-        y = _round(group, coupled, np.where(known, y[coupled.source], starts), start)
+        u = np.where(known, y[coupled.source], starts)
+        y = _round(group, coupled, u, external, start)
     return y
 
 
-def _round(group: SlaveGroup, coupled: CoupledSystem, u: FloatArray, start: float) -> FloatArray:
+def _first_outputs(part: SlavePart, starts: FloatArray, external: FloatArray) -> Program:
+    """What a slave is asked for before any output is known: external inputs are."""
+    if not part.external:
+        return (GetOutputs(),)
+    return (SetInputs(part.columns(starts[np.newaxis], external)), GetOutputs())
+
+
+def _round(
+    group: SlaveGroup, coupled: CoupledSystem, u: FloatArray, external: FloatArray, start: float
+) -> FloatArray:
     programs = [
-        (SetInputs(u[np.newaxis, part.input_slice]), GetOutputs()) for part in coupled.parts
+        (SetInputs(part.columns(u[np.newaxis], external)), GetOutputs()) for part in coupled.parts
     ]
     y: FloatArray = gather(coupled, group.execute_all(programs, start), -1)[0]
     return y
 
 
-def _iterate(group: SlaveGroup, coupled: CoupledSystem, start: float, y: FloatArray) -> FloatArray:
+def _iterate(
+    group: SlaveGroup, coupled: CoupledSystem, external: FloatArray, start: float, y: FloatArray
+) -> FloatArray:
     """Fixed-point iteration for an algebraic loop across slaves."""
     try:
         return fixed_point(
-            lambda y: _round(group, coupled, y[coupled.source], start),
+            lambda y: _round(group, coupled, y[coupled.source], external, start),
             y,
             tolerance=_LOOP_TOLERANCE,
             evaluations=_LOOP_ROUNDS,

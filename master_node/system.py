@@ -6,7 +6,7 @@ of one output.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
@@ -14,10 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from master_node.configuration import Connection, SlaveSettings, System
+from master_node.external_inputs import ExternalInput, ExternalInputs, SignalFunction
+from master_node.input_loading import load_signals
+from master_node.numerics.input_tables import Table
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
-from protocol.signals import FloatArray
-from protocol.slave import Causality, SlaveDescription, Variable, VariableType
+from protocol.signals import MAX_ORDER, FloatArray
+from protocol.slave import Causality, SlaveDescription, StartValue, Variable, VariableType
+
+Signals = Mapping[str, StartValue | Table | SignalFunction]
+"""What drives inputs from outside, by ``slave.variable``, see `load_signals`."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +31,13 @@ class SlavePart:
     """One slave's part of the whole.
 
     Attributes:
-        inputs, outputs: names of its connected inputs and of its continuous real outputs.
-        input_slice, output_slice: where they are in u and y.
-        input_starts: start values of the connected inputs, shape (len(inputs),).
+        inputs: names of its inputs that are driven: first the connected ones, then the external
+            ones; these are the columns of what it is given.
+        outputs: names of its continuous real outputs.
+        input_slice, output_slice: where its connected inputs and its outputs are in u and y.
+        external_slice: where its external inputs are among those of the system.
+        external_rows: how many rows of derivatives these need at most.
+        input_starts: start values of the connected inputs.
         description: as the slave gave it.
     """
 
@@ -36,8 +46,46 @@ class SlavePart:
     outputs: tuple[str, ...]
     input_slice: slice
     output_slice: slice
+    external_slice: slice
+    external_rows: int
     input_starts: FloatArray
     description: SlaveDescription
+
+    @property
+    def connected(self) -> tuple[str, ...]:
+        """Names of its connected inputs."""
+        return self.inputs[: self.input_slice.stop - self.input_slice.start]
+
+    @property
+    def external(self) -> tuple[str, ...]:
+        """Names of its external inputs."""
+        return self.inputs[self.input_slice.stop - self.input_slice.start :]
+
+    @property
+    def max_order(self) -> int:
+        """The highest degree of input polynomial that it takes: 0 without canInterpolateInputs."""
+        return _max_order(self.description)
+
+    def columns(self, connected: FloatArray, external: FloatArray) -> FloatArray:
+        """Its inputs out of those of the system.
+
+        Args:
+            connected: derivatives of all connected inputs, shape (rows, n).
+            external: of all external inputs, shape (4, n_e).
+
+        Returns:
+            Derivatives of ``inputs``, shape (rows, len(inputs)), with more rows where the external
+            inputs need them.
+        """
+        own = connected[:, self.input_slice]
+        if not self.external_rows:
+            return own
+        outside = external[: self.external_rows, self.external_slice]
+        number = own.shape[1]
+        both = np.zeros((max(len(own), len(outside)), number + outside.shape[1]))
+        both[: len(own), :number] = own
+        both[: len(outside), number:] = outside
+        return both
 
 
 @dataclass(frozen=True)
@@ -56,7 +104,7 @@ class FeedThroughOrder:
 
 @dataclass(frozen=True)
 class CoupledSystem:
-    """r slaves, m outputs, n connected inputs.
+    """r slaves, m outputs, n connected inputs, n_e external ones.
 
     Attributes:
         parts: the slaves in the order of the system file.
@@ -64,10 +112,13 @@ class CoupledSystem:
         output_names, output_units: ``slave.variable`` and units of the m outputs.
         output_slave: for each output the index of its slave, shape (m,).
         feed_through: whether an output depends directly on a connected input, shape (m,).
+        held_feed_through: whether it depends directly on an external input that changes, and that
+            its slave holds constant in each step, shape (m,).
         absolute_tolerance: ATOL_j, scaled by the nominal values, shape (m,), unit [y].
         relative_tolerance: RTOL_j, shape (m,).
         initialization, at_point: the order in which values propagate through the slaves in
             initialization mode and at a communication point.
+        external: the external inputs.
     """
 
     parts: tuple[SlavePart, ...]
@@ -76,14 +127,25 @@ class CoupledSystem:
     output_units: tuple[str, ...]
     output_slave: NDArray[np.intp]
     feed_through: NDArray[np.bool_]
+    held_feed_through: NDArray[np.bool_]
     absolute_tolerance: FloatArray
     relative_tolerance: FloatArray
     initialization: FeedThroughOrder
     at_point: FeedThroughOrder
+    external: ExternalInputs
 
 
-def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> CoupledSystem:
+def resolve(
+    system: System,
+    descriptions: Mapping[str, SlaveDescription],
+    signals: Signals | None = None,
+) -> CoupledSystem:
     """Check all names and types, and give every input and output its index.
+
+    Args:
+        system: the settings.
+        descriptions: of the slaves.
+        signals: what drives the external inputs; None: loaded here.
 
     Raises:
         ConfigurationError: with the system's source, the table, and the nearest names.
@@ -105,8 +167,11 @@ def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> Cou
     feeding: dict[str, dict[str, tuple[str, str]]] = {name: {} for name in descriptions}
     for source, (slave, variable) in ends:
         feeding[slave][variable] = source
-    parts = _parts(descriptions, feeding, outputs)
-    sources = [feeding[part.name][variable] for part in parts for variable in part.inputs]
+    external = _external_inputs(
+        system, descriptions, load_signals(system) if signals is None else signals
+    )
+    parts = _parts(descriptions, feeding, outputs, external)
+    sources = [feeding[part.name][variable] for part in parts for variable in part.connected]
     everything = [(s, v) for s in outputs for v in outputs[s]]
     tolerances = [_tolerance(system, slave, v) for slave, v in everything]
     initial = {part.name: part.description.initial_feed_through for part in parts}
@@ -118,43 +183,120 @@ def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> Cou
         output_names=tuple(f"{slave}.{v.name}" for slave, v in everything),
         output_units=tuple(v.unit for _, v in everything),
         output_slave=np.array([slave_index[slave] for slave, _ in everything], dtype=np.intp),
-        feed_through=np.array(
-            [
-                not set(part.description.feed_through.get(output, ())).isdisjoint(part.inputs)
-                for part in parts
-                for output in part.outputs
-            ]
+        feed_through=_depends(parts, {part.name: part.connected for part in parts}),
+        held_feed_through=_depends(
+            parts,
+            {
+                name: [
+                    one.variable for one in external[name] if not one.is_constant and not one.degree
+                ]
+                for name in descriptions
+            },
         ),
         absolute_tolerance=np.array([absolute for absolute, _ in tolerances]),
         relative_tolerance=np.array([relative for _, relative in tolerances]),
         initialization=_feed_through_order(output_index, initial, feeding),
         at_point=_feed_through_order(output_index, direct, feeding),
+        external=ExternalInputs([one for name in descriptions for one in external[name]]),
     )
+
+
+def _depends(parts: Sequence[SlavePart], inputs: Mapping[str, Sequence[str]]) -> NDArray[np.bool_]:
+    """Whether each output depends directly on one of these inputs of its slave, shape (m,)."""
+    return np.array(
+        [
+            not set(part.description.feed_through.get(output, ())).isdisjoint(inputs[part.name])
+            for part in parts
+            for output in part.outputs
+        ]
+    )
+
+
+def _max_order(description: SlaveDescription) -> int:
+    return MAX_ORDER if description.capabilities.can_interpolate_inputs else 0
 
 
 def _parts(
     descriptions: Mapping[str, SlaveDescription],
     feeding: Mapping[str, Mapping[str, tuple[str, str]]],
     outputs: Mapping[str, tuple[Variable, ...]],
+    external: Mapping[str, Sequence[ExternalInput]],
 ) -> tuple[SlavePart, ...]:
     parts = []
-    n = m = 0
+    n = m = n_e = 0
     for name, description in descriptions.items():
         inputs = [v for v in description.of(Causality.INPUT) if v.name in feeding[name]]
         parts.append(
             SlavePart(
                 name=name,
-                inputs=tuple(v.name for v in inputs),
+                inputs=(*(v.name for v in inputs), *(one.variable for one in external[name])),
                 outputs=tuple(v.name for v in outputs[name]),
                 input_slice=slice(n, n + len(inputs)),
                 output_slice=slice(m, m + len(outputs[name])),
+                external_slice=slice(n_e, n_e + len(external[name])),
+                external_rows=max((1 + one.degree for one in external[name]), default=0),
                 input_starts=np.array([float(v.start or 0.0) for v in inputs]),
                 description=description,
             )
         )
         n += len(inputs)
         m += len(outputs[name])
+        n_e += len(external[name])
     return tuple(parts)
+
+
+def _external_inputs(
+    system: System, descriptions: Mapping[str, SlaveDescription], signals: Signals
+) -> dict[str, list[ExternalInput]]:
+    """The external inputs of each slave, in the order of its variables."""
+    found: dict[str, dict[str, ExternalInput]] = {name: {} for name in descriptions}
+    feeding = {connection.target: connection.source for connection in system.connections}
+    for reference, signal in signals.items():
+        where = f"{system.source}: [inputs]"
+        slave, variable = _variable(where, "key", reference, descriptions)
+        if variable.causality is not Causality.INPUT:
+            inputs = [v.name for v in descriptions[slave].of(Causality.INPUT)]
+            raise ConfigurationError(
+                f"{where}: {reference} is not an input but of causality "
+                f"{variable.causality}{nearest(variable.name, inputs)}"
+            )
+        if reference in feeding:
+            raise ConfigurationError(
+                f"{where}: {reference} is driven twice: by {feeding[reference]} and from here"
+            )
+        absolute, relative = _tolerance(system, slave, variable)
+        found[slave][variable.name] = ExternalInput(
+            slave,
+            variable.name,
+            _driving(where, reference, variable, signal),
+            _max_order(descriptions[slave]),
+            absolute,
+            relative,
+        )
+    return {
+        name: [
+            found[name][v.name] for v in description.of(Causality.INPUT) if v.name in found[name]
+        ]
+        for name, description in descriptions.items()
+    }
+
+
+def _driving(
+    where: str, reference: str, variable: Variable, signal: StartValue | Table | SignalFunction
+) -> float | Table | SignalFunction:
+    """The signal, checked against the type of the variable that it drives."""
+    if not variable.is_continuous_real:
+        raise ConfigurationError(
+            f"{where}: {reference} is a {variable.variability} variable of type {variable.type}; "
+            "this version drives continuous variables of type Real"
+        )
+    if isinstance(signal, Table | SignalFunction):
+        return signal
+    if isinstance(signal, bool | str):
+        raise ConfigurationError(
+            f"{where}: {reference} is of type {variable.type} and cannot be {signal!r}"
+        )
+    return float(signal)
 
 
 _End = tuple[str, str]
