@@ -3,6 +3,7 @@
 from master_node.configuration import (
     BusSettings,
     Connection,
+    InputSettings,
     SimulationSettings,
     SlaveSettings,
     System,
@@ -14,6 +15,7 @@ from master_node.simulation import simulate
 __all__ = [
     "BusSettings",
     "Connection",
+    "InputSettings",
     "Result",
     "SimulationSettings",
     "SlaveSettings",

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from math import isfinite
 from pathlib import Path
 from types import ModuleType
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -134,10 +135,10 @@ def _read_csv(path: Path) -> Columns:
     if not lines:
         raise ConfigurationError(f"{path.name}: is empty")
     names = [name.strip() for name in lines[0]]
-    if len(set(names)) < len(names):
-        raise ConfigurationError(f"{path.name}: two columns of one name in {', '.join(names)}")
     if all(_is_number(name) for name in names):
         raise ConfigurationError(f"{path.name}: the first line must name the columns")
+    if len(set(names)) < len(names):
+        raise ConfigurationError(f"{path.name}: two columns of one name in {', '.join(names)}")
     for number, line in enumerate(lines[1:], 1):
         if len(line) != len(names):
             raise ConfigurationError(
@@ -164,8 +165,8 @@ def _read_numpy(path: Path) -> Columns:
     try:
         loaded = np.load(path, allow_pickle=False)
         arrays = {name: loaded[name] for name in loaded.files} if path.suffix == ".npz" else loaded
-    except (ValueError, EOFError, AttributeError) as error:
-        raise ConfigurationError(f"{path.name}: not a NumPy file of numbers: {error}") from error
+    except (ValueError, EOFError, AttributeError, BadZipFile) as error:
+        raise ConfigurationError(f"{path.name}: not a NumPy file of numbers") from error
     if isinstance(arrays, np.ndarray):
         if arrays.dtype.names is not None:
             arrays = {name: arrays[name] for name in arrays.dtype.names}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from master_node.co_simulation import CoSimulation, check_capabilities
-from master_node.configuration import System
+from master_node.configuration import InputSettings, System
 from master_node.input_loading import load_signals
 from master_node.observers import Observer, Observers
 from master_node.results import Recording, Result, ResultsWriter
@@ -109,6 +109,12 @@ def settings_of(system: System, descriptions: Mapping[str, SlaveDescription]) ->
         "smallest_step_size": simulation.smallest,
         "largest_step_size": simulation.largest,
         "slave_tolerance": simulation.slave_relative_tolerance,
+    }
+    settings["inputs"] = {
+        name: value.model_dump(mode="json", exclude_unset=True)
+        if isinstance(value, InputSettings)
+        else value
+        for name, value in system.inputs.items()
     }
     settings["system_file"] = system.source
     settings["models"] = {
