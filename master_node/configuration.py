@@ -364,11 +364,11 @@ class InputSettings(_Table):
     table: StrictStr | InputRows | None = None
     column: StrictStr | None = None
     time: StrictStr | None = None
-    interpolation: Literal["linear", "hold", "spline"] | None = None
+    interpolation: Literal["linear", "hold", "spline"] = "linear"
     extrapolate: Literal["hold"] | None = None
     function: StrictStr | Callable[[float], float] | None = None
     breakpoints: tuple[Number, ...] = ()
-    order: Literal[0, 1, 2, 3] | None = None
+    order: Literal[0, 1, 2, 3] = 3
 
     @field_validator("table", mode="before")
     @classmethod

@@ -23,7 +23,7 @@ from master_node.external_inputs import SignalFunction
 from master_node.numerics.input_tables import InputTableError, Table, make_table
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
-from protocol.signals import MAX_ORDER, FloatArray
+from protocol.signals import FloatArray
 from protocol.slave import StartValue
 
 Columns = Mapping[str, FloatArray]
@@ -74,7 +74,7 @@ def _table(
     return make_table(
         times,
         values,
-        setting.interpolation or "linear",
+        setting.interpolation,
         span,
         extrapolates=setting.extrapolate is not None,
     )
@@ -210,9 +210,7 @@ def _function(setting: InputSettings, system: System) -> SignalFunction:
     if not isfinite(value):
         raise ConfigurationError(f"the function is {value!r} at t={start!r} s")
     breakpoints = tuple(sorted(set(map(float, setting.breakpoints))))
-    return SignalFunction(
-        function, breakpoints, MAX_ORDER if setting.order is None else setting.order
-    )
+    return SignalFunction(function, breakpoints, setting.order)
 
 
 def _load_function(reference: str, base: Path) -> Callable[[float], float]:
