@@ -195,12 +195,7 @@ def _function(setting: InputSettings, system: System) -> SignalFunction:
     given = setting.function
     function = _load_function(given, system.base) if isinstance(given, str) else given
     assert function is not None
-    start, stop = float(system.simulation.start_time), system.simulation.end
-    for point in setting.breakpoints:
-        if not start < point < stop:
-            raise ConfigurationError(
-                f"the breakpoint at {point:g} is not between start and stop time"
-            )
+    start = float(system.simulation.start_time)
     try:
         value = float(function(start))
     except Exception as error:

@@ -340,9 +340,12 @@ def test_two_rows_of_one_time_are_a_jump_of_a_linear_table(estimator: str) -> No
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_breakpoints_of_a_function_are_jumps(estimator: str) -> None:
-    """The value on the left holds before, that on the right behind, on which side it is closed."""
+    """The value on the left holds before, that on the right behind, on which side it is closed.
+
+    Those that are not within the simulated time say nothing.
+    """
     for function in (lambda t: float(t >= 0.8), lambda t: float(t > 0.8)):
-        signal = InputSettings(function=function, breakpoints=[0.8])
+        signal = InputSettings(function=function, breakpoints=[STOP, 9.0, 0.8, -1.0, 0.0])
         result = driven(signal, estimator=estimator)
         assert 0.8 in result.time
         exact = table_motion(result.time, ([0.0, 0.8, STOP], [0.0, 1.0, 1.0]), hold=True)
@@ -651,7 +654,7 @@ def folder(tmp_path: Path) -> Path:
         ({"function": "no.such:f"}, "import of no.such failed"),
         ({"function": "functions.py:g"}, "the function fails at t=0.0 s: ValueError"),
         ({"function": "functions.py:h"}, "the function is nan at t=0.0 s"),
-        ({"function": "functions.py:f", "breakpoints": [5]}, "the breakpoint at 5 is not between"),
+        ({"function": "functions.py:f", "breakpoints": [math.inf]}, "must be finite"),
         (True, "oscillator.u is of type Real and cannot be True"),
         ("high", "oscillator.u is of type Real and cannot be 'high'"),
         (math.nan, "oscillator.u = nan: must be finite"),
