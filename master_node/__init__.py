@@ -3,6 +3,7 @@
 from master_node.configuration import (
     BusSettings,
     Connection,
+    InputSettings,
     SimulationSettings,
     SlaveSettings,
     System,
@@ -15,6 +16,7 @@ from master_node.system_files import open_system
 __all__ = [
     "BusSettings",
     "Connection",
+    "InputSettings",
     "Result",
     "SimulationSettings",
     "SlaveSettings",

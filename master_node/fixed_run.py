@@ -55,7 +55,8 @@ class FixedRun:
             inputs = partial(self._inputs, history, polynomials, end)
             rest = end - time  # H but for rounding, unless the last step is a shorter one
             step = DoStep(time, h if abs(rest - h) <= rounding else rest, True)
-            piece = Piece((), inputs, step, scheme.get_outputs, scheme.output_rows)
+            external = coupled.external.over(time, end)
+            piece = Piece((), inputs, external, step, scheme.get_outputs, scheme.output_rows)
             try:
                 (y,) = requests.take([piece])
             except BrokenOffError as broken_off:

@@ -79,7 +79,8 @@ def _initialize(part: SlavePart, system: System) -> Initialize:
         start_time=float(simulation.start_time),
         stop_time=simulation.end,
         relative_tolerance=simulation.slave_relative_tolerance,
-        start_values=start_values(part.description, system.slaves[part.name].parameters),
+        start_values=part.held
+        | start_values(part.description, system.slaves[part.name].parameters),
         inputs=part.inputs,
         outputs=part.outputs,
         discrete_inputs=part.discrete_inputs,
@@ -98,15 +99,16 @@ class _InitializationMode:
         self._group = group
         self._coupled = coupled
         self._start = start
+        self._external = coupled.external.at(start)[np.newaxis]
 
     def propagate(self) -> None:
         """Set all inputs to what belongs to the outputs, after enough rounds for every level."""
         coupled, order = self._coupled, self._coupled.initialization
-        outputs = self._round([()] * len(coupled.parts))
+        starts = np.concatenate([part.input_starts for part in coupled.parts])
+        outputs = self._round([self._external_inputs(part, starts) for part in coupled.parts])
         if order.loop:
             self._iterate(outputs)
             return
-        starts = np.concatenate([part.input_starts for part in coupled.parts])
         source_levels = order.levels[coupled.source]
         for level in range(order.highest + 1):
             u = np.where(source_levels <= level, coupled.inputs_of(outputs.y[0]), starts)
@@ -140,10 +142,16 @@ class _InitializationMode:
         worst = np.argsort(-np.abs(residual))[:3]
         return ", ".join(f"{self._coupled.output_names[i]} {residual[i]:.3g}" for i in worst)
 
+    def _external_inputs(self, part: SlavePart, starts: FloatArray) -> Program:
+        """The calls that set what is known before any output is."""
+        if not part.external:
+            return ()
+        return (SetInputs(part.columns(starts[np.newaxis], self._external)),)
+
     def _inputs(self, u: FloatArray, d: Sequence[DiscreteValues]) -> list[Program]:
         """The calls that set all inputs of each slave."""
         return [
-            (SetInputs(u[np.newaxis, part.input_slice]), *_discrete(values))
+            (SetInputs(part.columns(u[np.newaxis], self._external)), *_discrete(values))
             for part, values in zip(self._coupled.parts, d, strict=True)
         ]
 

@@ -59,7 +59,7 @@ class OrderSelection:
         )
         slaves = range(len(coupled.parts))
         self._has_derivative = scheme.input_has_derivative
-        self._slave_of_input = np.repeat(slaves, [len(part.inputs) for part in coupled.parts])
+        self._slave_of_input = np.repeat(slaves, [len(part.connected) for part in coupled.parts])
         kinds_of = {slave: frozenset[int]() for slave in slaves}
         direct = dict.fromkeys(slaves, False)
         for slave, output_kinds, feed_through in zip(

@@ -15,13 +15,22 @@ from graphlib import CycleError, TopologicalSorter
 import numpy as np
 from numpy.typing import NDArray
 
-from master_node.configuration import SlaveSettings, System
+from master_node.configuration import System
 from master_node.connections import ScalarConnection, VariableFinder, resolve_connections
 from master_node.discrete_coupling import DiscreteCoupling, couple_discrete
+from master_node.external_inputs import ExternalInputs
+from master_node.external_resolution import (
+    Signals,
+    SlaveExternals,
+    max_order,
+    resolve_external,
+)
+from master_node.input_loading import load_signals
+from master_node.tolerances import tolerance
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
 from protocol.signals import FloatArray
-from protocol.slave import Causality, SlaveDescription, Variable
+from protocol.slave import Causality, SlaveDescription, StartValue, Variable
 
 _Key = tuple[str, str]
 """Slave and variable by their names."""
@@ -32,12 +41,16 @@ class SlavePart:
     """One slave's part of the whole.
 
     Attributes:
-        inputs, outputs: names of its connected continuous inputs and of its continuous real
-            outputs.
+        inputs: names of its continuous inputs that are driven: first the connected ones, then the
+            external ones; these are the columns of what it is given.
+        outputs: names of its continuous real outputs.
         discrete_inputs, discrete_outputs: names of its other connected inputs, and of its other
             outputs.
-        input_slice, output_slice: where inputs and outputs are in u and y.
-        input_starts: start values of the inputs, shape (len(inputs),).
+        held: values of its other external inputs, by name.
+        input_slice, output_slice: where its connected inputs and its outputs are in u and y.
+        external_slice: where its external inputs are among those of the system.
+        external_rows: how many rows of derivatives these need at most.
+        input_starts: start values of the connected inputs.
         description: as the slave gave it.
     """
 
@@ -46,10 +59,49 @@ class SlavePart:
     outputs: tuple[str, ...]
     discrete_inputs: tuple[str, ...]
     discrete_outputs: tuple[str, ...]
+    held: dict[str, StartValue]
     input_slice: slice
     output_slice: slice
+    external_slice: slice
+    external_rows: int
     input_starts: FloatArray
     description: SlaveDescription
+
+    @property
+    def connected(self) -> tuple[str, ...]:
+        """Names of its connected continuous inputs."""
+        return self.inputs[: self.input_slice.stop - self.input_slice.start]
+
+    @property
+    def external(self) -> tuple[str, ...]:
+        """Names of its external inputs."""
+        return self.inputs[len(self.connected) :]
+
+    @property
+    def max_order(self) -> int:
+        """The highest degree of input polynomial that it follows."""
+        return max_order(self.description)
+
+    def columns(self, connected: FloatArray, external: FloatArray) -> FloatArray:
+        """Its inputs out of those of the system.
+
+        Args:
+            connected: derivatives of all connected inputs, shape (rows, n).
+            external: of all external inputs, shape (4, n_e).
+
+        Returns:
+            Derivatives of ``inputs``, shape (rows, len(inputs)), with more rows where the external
+            inputs need them.
+        """
+        own = connected[:, self.input_slice]
+        if not self.external_rows:
+            return own
+        outside = external[: self.external_rows, self.external_slice]
+        number = own.shape[1]
+        both = np.zeros((max(len(own), len(outside)), number + outside.shape[1]))
+        both[: len(own), :number] = own
+        both[: len(outside), number:] = outside
+        return both
 
 
 @dataclass(frozen=True)
@@ -89,6 +141,9 @@ class CoupledSystem:
         initialization, at_point: the order in which values propagate through the slaves in
             initialization mode and at a communication point.
         discrete: all connections and outputs that are not continuous.
+        external: the external inputs.
+        held_feed_through: whether an output depends directly on an external input that changes
+            and is held in each step, shape (m,).
     """
 
     parts: tuple[SlavePart, ...]
@@ -104,6 +159,8 @@ class CoupledSystem:
     initialization: FeedThroughOrder
     at_point: FeedThroughOrder
     discrete: DiscreteCoupling
+    external: ExternalInputs
+    held_feed_through: NDArray[np.bool_]
 
     @cached_property
     def _transforms(self) -> bool:
@@ -130,8 +187,17 @@ class CoupledSystem:
         return taken / np.abs(self.factor) if self._transforms else taken
 
 
-def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> CoupledSystem:
+def resolve(
+    system: System,
+    descriptions: Mapping[str, SlaveDescription],
+    signals: Signals | None = None,
+) -> CoupledSystem:
     """Check all names and types, and give every input and output its index.
+
+    Args:
+        system: the settings.
+        descriptions: of the slaves.
+        signals: what drives the external inputs; None: loaded here.
 
     Raises:
         ConfigurationError: with the system's source, the table, and the nearest names.
@@ -153,9 +219,12 @@ def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> Cou
     feeding: dict[str, dict[str, ScalarConnection]] = {name: {} for name in descriptions}
     for connection in connections:
         feeding[connection.target.slave][connection.target.variable.name] = connection
-    parts = _parts(descriptions, feeding, outputs)
-    feeds = [feeding[part.name][variable] for part in parts for variable in part.inputs]
-    tolerances = [_tolerance(system, slave, v) for slave, v in everything]
+    external = resolve_external(
+        system, finder, connections, load_signals(system) if signals is None else signals
+    )
+    parts = _parts(descriptions, feeding, outputs, external)
+    feeds = [feeding[part.name][variable] for part in parts for variable in part.connected]
+    tolerances = [tolerance(system, slave, v) for slave, v in everything]
     initial = {part.name: part.description.initial_feed_through for part in parts}
     direct = {part.name: part.description.feed_through for part in parts}
     slave_index = {name: i for i, name in enumerate(descriptions)}
@@ -172,19 +241,36 @@ def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> Cou
         output_names=tuple(f"{slave}.{v.name}" for slave, v in everything),
         output_units=tuple(v.unit for _, v in everything),
         output_slave=np.array([slave_index[slave] for slave, _ in everything], dtype=np.intp),
-        feed_through=np.array(
-            [
-                not set(part.description.feed_through.get(output, ())).isdisjoint(part.inputs)
-                for part in parts
-                for output in part.outputs
-            ],
-            dtype=np.bool_,
-        ),
+        feed_through=_depends(parts, {part.name: part.connected for part in parts}),
         absolute_tolerance=np.array([absolute for absolute, _ in tolerances]),
         relative_tolerance=np.array([relative for _, relative in tolerances]),
         initialization=_feed_through_order(output_index, discrete, initial, feeding),
         at_point=_feed_through_order(output_index, discrete, direct, feeding),
         discrete=discrete,
+        external=ExternalInputs([one for each in external.values() for one in each.continuous]),
+        held_feed_through=_depends(
+            parts,
+            {
+                name: [
+                    one.variable
+                    for one in each.continuous
+                    if not one.is_constant and not one.degree
+                ]
+                for name, each in external.items()
+            },
+        ),
+    )
+
+
+def _depends(parts: Sequence[SlavePart], inputs: Mapping[str, Sequence[str]]) -> NDArray[np.bool_]:
+    """Whether each output depends directly on one of these inputs of its slave, shape (m,)."""
+    return np.array(
+        [
+            not set(part.description.feed_through.get(output, ())).isdisjoint(inputs[part.name])
+            for part in parts
+            for output in part.outputs
+        ],
+        dtype=np.bool_,
     )
 
 
@@ -192,16 +278,20 @@ def _parts(
     descriptions: Mapping[str, SlaveDescription],
     feeding: Mapping[str, Mapping[str, ScalarConnection]],
     outputs: Mapping[str, tuple[Variable, ...]],
+    external: Mapping[str, SlaveExternals],
 ) -> tuple[SlavePart, ...]:
     parts = []
-    n = m = 0
+    n = m = n_e = 0
     for name, description in descriptions.items():
         connected = [v for v in description.of(Causality.INPUT) if v.name in feeding[name]]
         inputs = [v for v in connected if feeding[name][v.name].is_continuous]
         parts.append(
             SlavePart(
                 name=name,
-                inputs=tuple(v.name for v in inputs),
+                inputs=(
+                    *(v.name for v in inputs),
+                    *(one.variable for one in external[name].continuous),
+                ),
                 outputs=tuple(v.name for v in outputs[name]),
                 discrete_inputs=tuple(
                     v.name for v in connected if not feeding[name][v.name].is_continuous
@@ -209,14 +299,18 @@ def _parts(
                 discrete_outputs=tuple(
                     v.name for v in description.of(Causality.OUTPUT) if not v.is_continuous_real
                 ),
+                held=external[name].held,
                 input_slice=slice(n, n + len(inputs)),
                 output_slice=slice(m, m + len(outputs[name])),
+                external_slice=slice(n_e, n_e + len(external[name].continuous)),
+                external_rows=max((1 + one.degree for one in external[name].continuous), default=0),
                 input_starts=np.array([float(v.start or 0.0) for v in inputs]),
                 description=description,
             )
         )
         n += len(inputs)
         m += len(outputs[name])
+        n_e += len(external[name].continuous)
     return tuple(parts)
 
 
@@ -235,20 +329,6 @@ def _check_slave_tables(system: System, finder: VariableFinder) -> None:
                         f"{system.source}: [slaves.{slave}.{table}] {name!r}: "
                         f"no such variable{nearest(name, known)}"
                     )
-
-
-def _tolerance(system: System, slave: str, variable: Variable) -> tuple[float, float]:
-    """ATOL_j and RTOL_j: of the output, else of its slave, else of the simulation."""
-    settings: SlaveSettings = system.slaves[slave]
-    own = settings.tolerances.get(variable.name)
-    simulation = system.simulation
-    absolute = [own.absolute] if own else []
-    relative = [own.relative] if own else []
-    absolute += [settings.absolute_tolerance, simulation.absolute_tolerance]
-    relative += [settings.relative_tolerance, simulation.relative_tolerance]
-    atol = next(value for value in absolute if value is not None)
-    rtol = next(value for value in relative if value is not None)
-    return atol * variable.nominal, rtol
 
 
 def _feed_through_order(
