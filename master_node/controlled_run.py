@@ -70,6 +70,7 @@ class Position:
 
     @property
     def time(self) -> float:
+        """T_n [s]."""
         return self.history.times[0]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from master_node.coupling_scheme import CouplingScheme, slaves_without_rollback
-from master_node.numerics.defect_control import foreseen_step_size, largest_between
+from master_node.numerics.defect_control import TARGET, foreseen_step_size, largest_between
 from master_node.numerics.discontinuities import Defects, has_jumped_unnoticed
 from master_node.numerics.error_estimators import node_polynomial
 from master_node.numerics.extrapolation import CouplingHistory, Extrapolation, Polynomials
@@ -286,7 +286,7 @@ class CouplingDefects:
             defects = Defects(
                 0.0,
                 float(weighted[index]),
-                self._foreseen(history, polynomials, reached[0][0], weights, index),
+                max(TARGET, self._foreseen(history, polynomials, reached[0][0], weights, index)),
                 float(measured.changes[inputs[index]] * weights[index]),
                 int(inputs[index]),
             )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from master_node.coupling_defects import CouplingDefects, CouplingError, SingleStep
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial, Polynomials
-from master_node.numerics.initial_step_size import trial_step_size
+from master_node.numerics.initial_step_size import untried_step_size
 from master_node.numerics.order_control import (
     DEPTH,
     LARGEST_FACTOR,
@@ -23,7 +23,7 @@ from master_node.numerics.order_control import (
     ladder,
     prefer,
 )
-from master_node.observers import Attempt
+from master_node.observers import Attempt, Points
 from master_node.result_points import Reached, ResultPoints, count_accepted
 from master_node.run_context import RunContext
 from master_node.single_step import SingleStepper, remedy_without_rollback, unrepeatable
@@ -137,7 +137,7 @@ class DefectRun:
 
     def _cautious(self, y: FloatArray) -> float:
         """An H so small that the step need not be taken back [s]."""
-        return trial_step_size(
+        return untried_step_size(
             y[0],
             y[1] if len(y) > 1 and self._scheme.has_derivative.all() else None,
             1.0 / self._coupling.weights(y[0]),
@@ -156,13 +156,13 @@ class DefectRun:
         """One step to ``end`` [s], and what comes next."""
         following, polynomials, error = self._take(position, end, size)
         reached: Reached = ((end, following.y),)
+        attempt = _attempt(position.time, size, polynomials, error)
         if error.has_jumped and self._settings.discontinuities:
             self._statistics.discontinuities += 1
-            name = f"{error.limiting_variable} jumps"
-            self._tell(position, size, polynomials, error.norm, name, reached, jumped=True)
+            attempt = attempt._replace(limiting_variable=f"{error.limiting_variable} jumps")
+            self._tell(attempt, reached, self._results.jumped(reached))
             return self._behind_jump(following)
-        name = error.limiting_variable
-        self._tell(position, size, polynomials, error.norm, name, reached, jumped=False)
+        self._tell(attempt, reached, self._results.reached(reached, attempt.order))
         return self._with_next_step_size(following, size)
 
     def _cross(self, position: _Position, times: DoubleStepTimes) -> _Position:
@@ -170,7 +170,9 @@ class DefectRun:
         for end, size in ((times.middle, times.first), (times.end, times.second)):
             following, polynomials, error = self._take(position, end, size)
             reached: Reached = ((end, following.y),)
-            self._tell(position, size, polynomials, error.norm, "event", reached, jumped=True)
+            attempt = _attempt(position.time, size, polynomials, error)
+            attempt = attempt._replace(limiting_variable="event")
+            self._tell(attempt, reached, self._results.jumped(reached))
             position = following
         self._statistics.discontinuities += 1
         return self._behind_jump(position)
@@ -248,25 +250,22 @@ class DefectRun:
             )
         )
 
-    def _tell(
-        self,
-        position: _Position,
-        size: float,
-        polynomials: Polynomials,
-        norm: float,
-        name: str,
-        reached: Reached,
-        *,
-        jumped: bool,
-    ) -> None:
+    def _tell(self, attempt: Attempt, reached: Reached, points: Points) -> None:
         """Tell the observers of a step and count it."""
-        count_accepted(self._statistics, size, reached)
-        if not norm <= 1.0:
+        count_accepted(self._statistics, attempt.step_size, reached)
+        if not attempt.error_norm <= 1.0:
             self._statistics.steps_above_tolerance += 1
-        order = max(polynomial.order for polynomial in polynomials)
-        slopes = max(polynomial.derivative_points for polynomial in polynomials)
-        results = self._results
-        points = results.jumped(reached) if jumped else results.reached(reached, order)
-        self._observer.attempted(
-            Attempt(position.time, size, order, slopes, norm, True, name, points)
-        )
+        self._observer.attempted(attempt._replace(points=points))
+
+
+def _attempt(time: float, size: float, polynomials: Polynomials, error: CouplingError) -> Attempt:
+    """What observers are told of a step, but for the points that it reached."""
+    return Attempt(
+        time,
+        size,
+        max(polynomial.order for polynomial in polynomials),
+        max(polynomial.derivative_points for polynomial in polynomials),
+        error.norm,
+        True,
+        error.limiting_variable,
+    )

@@ -19,7 +19,7 @@ from master_node.late_slaves import LateSlaves
 from master_node.numerics.discontinuities import Defects
 from master_node.numerics.error_estimators import ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial, Polynomials
-from master_node.numerics.initial_step_size import trial_step_size
+from master_node.numerics.initial_step_size import untried_step_size
 from master_node.numerics.order_control import LARGEST_FACTOR, SMALLEST_FACTOR, Candidate
 from master_node.order_selection import OrderSelection
 from master_node.run_context import RunContext
@@ -80,13 +80,13 @@ class MixedRun(ControlledRun):
     def _with_initial_step_size(self, position: Position, largest: float) -> Position:
         """The position with an H so small that the first step need not be taken back."""
         y, settings = position.y, self._settings
-        trial = trial_step_size(
+        untried = untried_step_size(
             y[0],
             y[1] if len(y) > 1 and self._scheme.has_derivative.all() else None,
             1.0 / self._coupling.weights(y[0]),
             settings.end - self._start,
         )
-        return replace(position, step_size=self._controller.bounded(min(trial, largest)))
+        return replace(position, step_size=self._controller.bounded(min(untried, largest)))
 
     def _accept(
         self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
