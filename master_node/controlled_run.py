@@ -1,6 +1,6 @@
 """A run with error-controlled step sizes: attempt -> judge -> accept or go back.
 
-What is tried next is a value (`_Position`), so a rejected step is one that is not put in its place.
+What is tried next is a value (`Position`), so a rejected step is one that is not put in its place.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _TRIALS = 5
 
 
 @dataclass(frozen=True, slots=True)
-class _Position:
+class Position:
     """Where a run stands and what it will try next.
 
     Attributes:
@@ -71,6 +71,7 @@ class _Position:
 
     @property
     def time(self) -> float:
+        """T_n [s]."""
         return self.history.times[0]
 
 
@@ -100,8 +101,8 @@ class ControlledRun:
         # Where H is a multiple of something a double step cannot end wherever a kink is.
         kinks = external.kinks if self._limits.quantum is None else ()
         self._landing_points = LandingPoints(kinks, self._limits.smallest)
-        self._stepper = DoubleStepper(context.group, coupled, scheme, estimator)
-        self._control = ErrorControl(coupled, scheme, estimator, settings.constants)
+        self._stepper = self._make_stepper(context, estimator)
+        self._control = self._make_control(context, estimator)
         self._defects = InputDefects(coupled, scheme, self._control)
         present, past = EXPONENTS[settings.controller]
         self._controller = StepSizeController(
@@ -116,14 +117,25 @@ class ControlledRun:
         )
         self._orders = None
         if settings.order == "auto":
-            self._orders = OrderSelection(
-                coupled,
-                scheme,
-                control=self._control,
-                estimator=estimator,
-                largest=settings.polynomial,
-                alpha=settings.alpha,
-            )
+            self._orders = self._make_orders(context, estimator)
+
+    def _make_stepper(self, context: RunContext, estimator: ErrorEstimator) -> DoubleStepper:
+        return DoubleStepper(context.group, context.coupled, context.scheme, estimator)
+
+    def _make_control(self, context: RunContext, estimator: ErrorEstimator) -> ErrorControl:
+        constants = context.system.simulation.constants
+        return ErrorControl(context.coupled, context.scheme, estimator, constants)
+
+    def _make_orders(self, context: RunContext, estimator: ErrorEstimator) -> OrderSelection:
+        settings = context.system.simulation
+        return OrderSelection(
+            context.coupled,
+            context.scheme,
+            control=self._control,
+            estimator=estimator,
+            largest=settings.polynomial,
+            alpha=settings.alpha,
+        )
 
     def run(self, y: FloatArray) -> str:
         """Step from outputs ``y`` at T_0, shape (rows, m), to the stop time.
@@ -159,13 +171,11 @@ class ControlledRun:
 
     # --- beginnings -----------------------------------------------------------------------------
 
-    def _first_position(self, y: FloatArray) -> _Position:
+    def _first_position(self, y: FloatArray) -> Position:
         settings, u = self._settings, self._coupled.inputs_of(y)
-        points = settings.polynomial.order + 1  # an input without a derivative needs them all
-        depth = self._estimator.points(points) + self._scheme.known_ahead
-        depth = max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
+        depth = self._depth(settings.polynomial.order + 1)  # inputs without derivatives need all
         history = CouplingHistory.start(self._start, u, depth)
-        position = _Position(history, y, settings.step_size, self._restarted_order())
+        position = Position(history, y, settings.step_size, self._restarted_order())
         if settings.initial_step_size is None:
             position = self._with_initial_step_size(position, self._limits.largest)
         step_size = self._controller.bounded(position.step_size)
@@ -173,12 +183,17 @@ class ControlledRun:
             history = CouplingHistory.at_rest(self._start, u, depth, step_size)
         return replace(position, history=history, step_size=step_size)
 
+    def _depth(self, points: int) -> int:
+        """How many communication points are kept for polynomials through ``points`` points."""
+        depth = self._estimator.points(points) + self._scheme.known_ahead
+        return max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
+
     def _restarted_order(self) -> OrderMemory:
         if self._orders is None:
             return OrderMemory(self._settings.polynomial)
         return self._orders.restart()
 
-    def _with_initial_step_size(self, position: _Position, largest: float) -> _Position:
+    def _with_initial_step_size(self, position: Position, largest: float) -> Position:
         """The position with H from the behaviour of the slaves there, ``largest`` at most [s]."""
         y, stop = position.y, self._settings.end
         scale = 1.0 / self._control.weights(y[0])
@@ -208,13 +223,13 @@ class ControlledRun:
             trial = 0.1 * times.first
         return replace(position, step_size=self._controller.bounded(trial))
 
-    def _polynomials(self, position: _Position) -> Polynomials:
+    def _polynomials(self, position: Position) -> Polynomials:
         points = self._estimator.available(len(position.history.times))
         return self._scheme.extrapolation.polynomials(position.order.polynomial, points)
 
     # --- one attempt ----------------------------------------------------------------------------
 
-    def _advance(self, position: _Position, target: float) -> _Position | str:
+    def _advance(self, position: Position, target: float) -> Position | str:
         """One double step, or the attempt of one, towards ``target`` [s]."""
         wanted = step_within(
             position.bracket, position.time, position.step_size, self._limits.smallest
@@ -246,8 +261,8 @@ class ControlledRun:
         return self._reject(position, step, error, defects)
 
     def _accept(
-        self, position: _Position, step: DoubleStep, error: StepError, defects: Defects | None
-    ) -> _Position:
+        self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
+    ) -> Position:
         self._stepper.accepted()
         times, polynomials = step.times, step.polynomials
         history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
@@ -272,11 +287,11 @@ class ControlledRun:
         if bracket.end is not None:
             self._statistics.double_steps_at_discontinuities += 1
             if times.end >= bracket.end:  # a false alarm; points so near say nothing of larger H
-                return _Position(
+                return Position(
                     history.cut(), step.end, position.step_size, self._restarted_order()
                 )
         smooth = None if defects is None else (times.first, defects.largest)
-        return _Position(
+        return Position(
             history,
             step.end,
             following,
@@ -287,8 +302,8 @@ class ControlledRun:
         )
 
     def _reject(
-        self, position: _Position, step: DoubleStep, error: StepError, defects: Defects | None
-    ) -> _Position:
+        self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
+    ) -> Position:
         times, bracket = step.times, position.bracket
         is_noticed = error.norm > 1.0 or not error.norm < _INF
         if self._is_smallest(times) and is_noticed:
@@ -315,11 +330,11 @@ class ControlledRun:
 
     def _after_failure(
         self,
-        position: _Position,
+        position: Position,
         failed: FailedStep,
         times: DoubleStepTimes,
         polynomials: Polynomials,
-    ) -> _Position | str:
+    ) -> Position | str:
         if failed.status is StepStatus.TERMINATED:
             return f"{failed.slave} ended the simulation after t={times.begin!r} s"
         errors_in_a_row = position.errors_in_a_row + (failed.error is not None)
@@ -358,7 +373,7 @@ class ControlledRun:
 
     # --- discontinuities ------------------------------------------------------------------------
 
-    def _cross(self, position: _Position, times: DoubleStepTimes, name: str) -> _Position | str:
+    def _cross(self, position: Position, times: DoubleStepTimes, name: str) -> Position | str:
         """The double step over a known event, whatever its error is."""
         polynomials = self._polynomials(position)
         step = self._stepper.attempt(position.history, times, polynomials)
@@ -372,8 +387,8 @@ class ControlledRun:
         return self._accept_jump(position, step, error, name)
 
     def _accept_jump(
-        self, position: _Position, step: DoubleStep, error: StepError, name: str
-    ) -> _Position:
+        self, position: Position, step: DoubleStep, error: StepError, name: str
+    ) -> Position:
         """Go on behind a discontinuity: history cut, order and step size as at the start."""
         if not error.norm < _INF:
             raise self._stuck(error, step.times)
@@ -385,7 +400,7 @@ class ControlledRun:
         error = error._replace(limiting_variable=name)
         self._tell_accepted(step, error, reached, self._results.jumped(reached))
         history = step.history.pushed(times.end, self._coupled.inputs_of(step.end)).cut()
-        behind = _Position(history, step.end, position.step_size, self._restarted_order())
+        behind = Position(history, step.end, position.step_size, self._restarted_order())
         if times.end >= self._settings.end:
             return behind
         return self._with_initial_step_size(behind, position.step_size)

@@ -21,6 +21,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from master_node.coupling_scheme import CouplingScheme
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import Comparison, ErrorEstimator
@@ -191,3 +193,44 @@ class DoubleStepper:
         if ahead:
             history = history.pushed(time, self._coupled.inputs_of(known))
         return self._scheme.extrapolation.signal(history, polynomials, ahead)
+
+
+class PartialDoubleStepper(DoubleStepper):
+    """Takes the double steps of the slaves that can go back, where not all can.
+
+    Their inputs from the others have the polynomial through the communication points up to T_n in
+    all steps: no newer value is known, and the comparison solution cannot tell its error. Output
+    columns of the others are 0.
+
+    Args:
+        group: the slaves, at their first communication point.
+        coupled: their connections.
+        scheme: how they are coupled within a step.
+        estimator: which comparison solution to compute.
+    """
+
+    def __init__(
+        self,
+        group: SlaveGroup,
+        coupled: CoupledSystem,
+        scheme: CouplingScheme,
+        estimator: ErrorEstimator,
+    ) -> None:
+        super().__init__(group, coupled, scheme, estimator)
+        kinds = np.array([kind.late for kind in scheme.extrapolation.kinds])
+        self._late_inputs = np.flatnonzero(kinds[scheme.extrapolation.kind_of_input])
+
+    def _attempt(
+        self, history: CouplingHistory, times: DoubleStepTimes, polynomials: Polynomials
+    ) -> DoubleStep:
+        self._begin = times.begin
+        self._from_begin = self._scheme.extrapolation.signal(history, polynomials)
+        return super()._attempt(history, times, polynomials)
+
+    def _signal(
+        self, history: CouplingHistory, polynomials: Polynomials, time: float, known: FloatArray
+    ) -> InputSignal:
+        derivatives = super()._signal(history, polynomials, time, known).derivatives
+        late = self._from_begin.shifted(history.times[0] - self._begin).derivatives
+        derivatives[:, self._late_inputs] = late[:, self._late_inputs]
+        return InputSignal(derivatives)

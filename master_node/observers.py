@@ -6,12 +6,30 @@ that raises ends the run with that error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple, Protocol
 
 from protocol.signals import FloatArray
+
+
+class OutputControl(NamedTuple):
+    """Which outputs are controlled how, as ``slave.variable``; both may be said of one.
+
+    Attributes:
+        double_step: those whose error is estimated with a comparison solution, before the double
+            step is accepted.
+        input_defects: those of slaves without rollback and of slaves that get inputs from such:
+            the defects of these inputs are known after the step, and bound the next one.
+    """
+
+    double_step: tuple[str, ...] = ()
+    input_defects: tuple[str, ...] = ()
+
+
+NOT_CONTROLLED = OutputControl()
+"""Without an estimator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +41,8 @@ class RunStart:
         output_units: their units, "" where none.
         start_time, stop_time: [s].
         outputs: y(T_0), shape (m,).
+        control: how the outputs are controlled.
+        state_kinds: how the state of each slave is saved, by its name.
     """
 
     output_names: tuple[str, ...]
@@ -30,6 +50,8 @@ class RunStart:
     start_time: float
     stop_time: float
     outputs: FloatArray
+    control: OutputControl = NOT_CONTROLLED
+    state_kinds: Mapping[str, str] = field(default_factory=dict)
 
 
 Points = tuple[tuple[float, FloatArray], ...]
@@ -94,6 +116,8 @@ class Statistics:
         wall_time: seconds of the whole stepping phase.
         discontinuities: how many were found or declared.
         double_steps_at_discontinuities: attempts spent on finding and crossing them.
+        steps_above_tolerance: double steps, or single ones where no slave has rollback, that had
+            ERR above 1 when it was too late to reject them.
         time: the last accepted communication point [s].
         smallest_step_size, largest_step_size: over accepted steps [s]; NaN before the first.
     """
@@ -102,6 +126,7 @@ class Statistics:
     rejected_double_steps: int = 0
     discontinuities: int = 0
     double_steps_at_discontinuities: int = 0
+    steps_above_tolerance: int = 0
     round_trips: int = 0
     wait_time: float = 0.0
     wall_time: float = 0.0

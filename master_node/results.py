@@ -377,7 +377,8 @@ class Result:
 def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> dict[str, Any]:
     """The summary of a run as plain data for JSON; a number that is not finite is None.
 
-    ``do_steps``, ``rollbacks``, ``requests`` and ``compute_time`` [s] are maps by slave.
+    ``state_kind``, ``do_steps``, ``rollbacks``, ``requests`` and ``compute_time`` [s] are maps by
+    slave, ``controlled_by`` is one by the kind of control.
     """
     statistics = end.statistics
     simulation = settings.get("simulation")
@@ -396,6 +397,9 @@ def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> d
             "rejected_double_steps": statistics.rejected_double_steps,
             "discontinuities": statistics.discontinuities,
             "double_steps_at_discontinuities": statistics.double_steps_at_discontinuities,
+            "steps_above_tolerance": statistics.steps_above_tolerance,
+            "controlled_by": start.control._asdict(),
+            "state_kind": start.state_kinds,
             "smallest_step_size": statistics.smallest_step_size,
             "largest_step_size": statistics.largest_step_size,
             "round_trips": statistics.round_trips,

@@ -51,6 +51,7 @@ class FailedStep:
         reached: which part of its step the slave completed, 0 to 1; NaN when unknown.
         reason: for ``steps.csv`` and messages: a variable or a slave, and what happened.
         error: of the slave, if it returned one.
+        step: that was not completed; None when it was a value that is not finite.
     """
 
     slave: str
@@ -58,6 +59,7 @@ class FailedStep:
     reached: float
     reason: str
     error: DoublestepError | None = None
+    step: DoStep | None = None
 
 
 Inputs = Callable[[FloatArray], FloatArray]
@@ -214,4 +216,4 @@ def _failure(slave: str, program: Program, reply: Reply) -> FailedStep:
     assert isinstance(call, DoStep)
     assert isinstance(result, StepResult)
     reached = (result.time - call.communication_point) / call.step_size
-    return FailedStep(slave, result.status, reached, f"{slave}: {result.status}")
+    return FailedStep(slave, result.status, reached, f"{slave}: {result.status}", step=call)
