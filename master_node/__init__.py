@@ -3,6 +3,7 @@
 from master_node.configuration import (
     BusSettings,
     Connection,
+    ResultsSettings,
     SimulationSettings,
     SlaveSettings,
     System,
@@ -15,6 +16,7 @@ __all__ = [
     "BusSettings",
     "Connection",
     "Result",
+    "ResultsSettings",
     "SimulationSettings",
     "SlaveSettings",
     "System",

@@ -9,9 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from protocol.signals import FloatArray
+
+DiscreteType = Literal["float", "integer", "boolean", "string", "binary"]
+"""What a discrete variable holds: FMI's Real, Integer or Enumeration, Boolean, String, Binary."""
+
+DiscreteValue = float | int | bool | str | bytes
+"""A value of one of these types, in their order. An ``integer`` has 64 bits and a sign."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +29,11 @@ class RunStart:
         output_units: their units, "" where none.
         start_time, stop_time: [s].
         outputs: y(T_0), shape (m,).
+        discrete_names: ``slave.variable`` of the d variables beside the outputs that do not
+            change continuously, in the order of all tuples of discrete values.
+        discrete_types: what they hold, d of them.
+        discrete_units: their units, "" where none; empty when none has one.
+        discrete: their values at T_0, d of them.
     """
 
     output_names: tuple[str, ...]
@@ -30,10 +41,28 @@ class RunStart:
     start_time: float
     stop_time: float
     outputs: FloatArray
+    discrete_names: tuple[str, ...] = ()
+    discrete_types: tuple[DiscreteType, ...] = ()
+    discrete_units: tuple[str, ...] = ()
+    discrete: tuple[DiscreteValue, ...] = ()
 
 
-Points = tuple[tuple[float, FloatArray], ...]
-"""Times [s] and the outputs there, shape (m,) each."""
+class Point(NamedTuple):
+    """Where a result is wanted.
+
+    Attributes:
+        time: [s].
+        outputs: y there, shape (m,).
+        discrete: values of the d discrete variables there.
+    """
+
+    time: float
+    outputs: FloatArray
+    discrete: tuple[DiscreteValue, ...] = ()
+
+
+Points = tuple[Point, ...]
+"""In the order of time."""
 
 
 class Attempt(NamedTuple):
@@ -113,11 +142,19 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class RunEnd:
-    """How it went. ``message`` is the error's or the slave's text, "" when completed."""
+    """How it went.
+
+    Attributes:
+        outcome: how the run ended.
+        statistics: counters of the run.
+        message: the error's or the slave's text, "" when completed.
+        points: results that are wanted after all, behind those of the last attempt.
+    """
 
     outcome: Outcome
     statistics: Statistics
     message: str = ""
+    points: Points = ()
 
 
 class Observer(Protocol):
