@@ -33,6 +33,7 @@ from master_node.configuration import (
     BusSettings,
     Connection,
     OutputTolerance,
+    ResultsSettings,
     SimulationSettings,
     SlaveSettings,
     System,
@@ -299,6 +300,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "## `[slaves.NAME]`": SlaveSettings,
     "## `[slaves.NAME.tolerances.OUTPUT]`": OutputTolerance,
     "## `[[connections]]`": Connection,
+    "## `[results]`": ResultsSettings,
     "## `[bus]`": BusSettings,
 }
 
