@@ -9,9 +9,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from protocol.signals import FloatArray
+
+DiscreteType = Literal["float", "integer", "boolean", "string", "binary"]
+"""What a discrete variable holds: FMI's Real, Integer or Enumeration, Boolean, String, Binary."""
+
+DiscreteValue = float | int | bool | str | bytes
+"""A value of one of these types, in their order. An ``integer`` has 64 bits and a sign."""
 
 
 class OutputControl(NamedTuple):
@@ -43,6 +49,11 @@ class RunStart:
         outputs: y(T_0), shape (m,).
         control: how the outputs are controlled.
         state_kinds: how the state of each slave is saved, by its name.
+        discrete_names: ``slave.variable`` of the d variables beside the outputs that do not
+            change continuously, in the order of all tuples of discrete values.
+        discrete_types: what they hold, d of them.
+        discrete_units: their units, "" where none; empty when none has one.
+        discrete: their values at T_0, d of them.
     """
 
     output_names: tuple[str, ...]
@@ -50,12 +61,30 @@ class RunStart:
     start_time: float
     stop_time: float
     outputs: FloatArray
+    discrete_names: tuple[str, ...] = ()
+    discrete_types: tuple[DiscreteType, ...] = ()
+    discrete_units: tuple[str, ...] = ()
+    discrete: tuple[DiscreteValue, ...] = ()
     control: OutputControl = NOT_CONTROLLED
     state_kinds: Mapping[str, str] = field(default_factory=dict)
 
 
-Points = tuple[tuple[float, FloatArray], ...]
-"""Times [s] and the outputs there, shape (m,) each."""
+class Point(NamedTuple):
+    """Where a result is wanted.
+
+    Attributes:
+        time: [s].
+        outputs: y there, shape (m,).
+        discrete: values of the d discrete variables there.
+    """
+
+    time: float
+    outputs: FloatArray
+    discrete: tuple[DiscreteValue, ...] = ()
+
+
+Points = tuple[Point, ...]
+"""In the order of time."""
 
 
 class Attempt(NamedTuple):
@@ -138,11 +167,19 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class RunEnd:
-    """How it went. ``message`` is the error's or the slave's text, "" when completed."""
+    """How it went.
+
+    Attributes:
+        outcome: how the run ended.
+        statistics: counters of the run.
+        message: the error's or the slave's text, "" when completed.
+        points: results that are wanted after all, behind those of the last attempt.
+    """
 
     outcome: Outcome
     statistics: Statistics
     message: str = ""
+    points: Points = ()
 
 
 class Observer(Protocol):
