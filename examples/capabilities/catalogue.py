@@ -207,7 +207,7 @@ def quarter_car() -> Iterator[Fmu]:
         description = read_description(path / "modelDescription.xml")
         for variant, (version, capabilities) in variants.items():
             described = replace(description, name=f"{half}_{variant}")
-            definitions = {}
+            definitions: dict[str, str] = {}
             if variant == "fmi3_intermediate":
                 definitions["INTERNAL_STEP"] = "0.001"
                 described = with_variables(
@@ -523,10 +523,9 @@ OUT = 100
 
 def all_types2() -> Fmu:
     """Every type of FMI 2.0."""
-    discrete = {"variability": "discrete"}
     pairs = (
         Variable("real_continuous", 0, "", start="0"),
-        Variable("real_discrete", 1, "", start="0", **discrete),
+        Variable("real_discrete", 1, "", start="0", variability="discrete"),
         Variable("integer", 2, "", "Int32", start="0"),
         Variable("boolean", 3, "", "Boolean", start="false"),
         Variable("string", 4, "", "String", start=""),
