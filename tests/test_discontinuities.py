@@ -88,7 +88,7 @@ def test_a_jump_is_found_wherever_it_is(
 ) -> None:
     """Law: one jump is found wherever it is, unless ERR alone has made it as small as any error.
 
-    Rejections come first, and they may end with an H whose ERR is within the tolerance, jump and all.
+    Rejections come first; they may end with an H whose ERR is within the tolerance, jump and all.
     """
     result = kick(oscillator_dir, t_step)
     found = crossings(result)
