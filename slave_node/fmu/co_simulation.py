@@ -1,0 +1,125 @@
+"""What FMUs for co-simulation have in common as slaves, whatever their version of FMI.
+
+Arrays go to and come from buffers that are made once, so that the hot path neither allocates in
+C types nor loops over variables in Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from protocol.errors import SlaveError
+from protocol.signals import MAX_ORDER, FloatArray
+from protocol.slave import Slave, SlaveDescription, StartValue
+from slave_node.fmu.exchange import Buffer
+from slave_node.fmu.instance import FmuInstance
+
+
+class CoSimulationSlave(Slave):
+    """One instance of a co-simulation FMU.
+
+    A subclass makes the buffers and says how to initialize and to step.
+
+    Args:
+        instance: the FMU; the slave closes it.
+    """
+
+    _inputs: Buffer
+    _outputs: Buffer
+
+    def __init__(self, instance: FmuInstance) -> None:
+        self._instance = instance
+        self.description: SlaveDescription = instance.model.description
+        can = self.description.capabilities
+        self._max_rows = MAX_ORDER + 1 if can.can_interpolate_inputs else 1
+        self._max_order = min(can.max_output_derivative_order, MAX_ORDER)
+        self._rows_set = 1
+        self._discrete_inputs = instance.discrete(())
+        self._discrete_outputs = instance.discrete(())
+
+    def set_inputs(self, derivatives: FloatArray) -> None:
+        """See `Slave`. A derivative once set stays set, so those above the order are zeroed."""
+        inputs = self._inputs
+        rows, columns = derivatives.shape
+        if columns != inputs.size or rows > self._max_rows:
+            raise SlaveError(
+                f"{rows} rows of {columns} input values; it takes up to {self._max_rows} rows of "
+                f"values for {inputs.size} inputs"
+            )
+        if columns == 0:
+            return
+        if rows < self._rows_set:
+            inputs.rows[rows:] = 0.0
+        else:
+            self._rows_set = rows
+        inputs.first[rows][...] = derivatives
+        status = inputs.transfer_values()
+        if status:
+            self._instance.check(inputs.values_function, status)
+        if self._rows_set > 1:
+            status = inputs.transfer_derivatives[self._rows_set - 1]()
+            if status:
+                self._instance.check(inputs.derivatives_function, status)
+
+    def get_outputs(self, order: int) -> FloatArray:
+        """See `Slave`."""
+        if not 0 <= order <= self._max_order:
+            raise SlaveError(
+                f"output derivatives of order {order} asked for; it gives orders up to "
+                f"{self._max_order}"
+            )
+        outputs = self._outputs
+        if outputs.size:
+            status = outputs.transfer_values()
+            if status:
+                self._instance.check(outputs.values_function, status)
+            if order:
+                status = outputs.transfer_derivatives[order]()
+                if status:
+                    self._instance.check(outputs.derivatives_function, status)
+        return outputs.first[order + 1].copy()
+
+    def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
+        """See `Slave`.
+
+        Raises:
+            SlaveError: a value is not of the type of its variable, or the FMU refused.
+        """
+        self._discrete_inputs.put(values, SlaveError)
+        self._discrete_inputs.send()
+
+    def get_discrete_outputs(self) -> tuple[StartValue, ...]:
+        """See `Slave`."""
+        return self._discrete_outputs.receive()
+
+    def get_state(self) -> object:
+        """See `Slave`."""
+        return self._instance.get_state()
+
+    def set_state(self, state: object) -> None:
+        """See `Slave`."""
+        self._instance.set_state(state)
+
+    def free_state(self, state: object) -> None:
+        """See `Slave`."""
+        self._instance.free_state(state)
+
+    def serialize_state(self, state: object) -> bytes:
+        """See `Slave`."""
+        return self._instance.serialize_state(state)
+
+    def deserialize_state(self, data: bytes) -> object:
+        """See `Slave`."""
+        return self._instance.deserialize_state(data)
+
+    def terminate(self) -> None:
+        """See `Slave`."""
+        self._instance.call(self._instance.fmu.terminate)
+
+    def reset(self) -> None:
+        """See `Slave`."""
+        self._instance.call(self._instance.fmu.reset)
+
+    def close(self) -> None:
+        """See `Slave`."""
+        self._instance.close()
