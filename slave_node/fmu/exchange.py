@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.signals import MAX_ORDER, FloatArray
+from protocol.signals import MAX_ORDER, FloatArray, InputSignal
 from protocol.slave import VariableType
 from slave_node.fmu.variables import Place
 
@@ -56,8 +56,8 @@ class Buffer:
         self.first = [self.rows[:r] for r in range(MAX_ORDER + 2)]
         self.values_function = ""
         self.derivatives_function = ""
-        self.transfer_values: Callable[[], int]
-        self.transfer_derivatives: Sequence[Callable[[], int]]
+        self.transfer_values: Callable[[], int] = _nothing
+        self.transfer_derivatives: Sequence[Callable[[], int]] = [_nothing] * (MAX_ORDER + 1)
 
 
 class ExchangeBuffer(Buffer):
@@ -67,7 +67,7 @@ class ExchangeBuffer(Buffer):
         references: value references, shape (n,).
         values: name of and fmi2GetReal or fmi2SetReal with ``VALUES_CALL``, component bound.
         derivatives: the same of fmi2SetRealInputDerivatives or fmi2GetRealOutputDerivatives with
-            ``DERIVATIVES_CALL``.
+            ``DERIVATIVES_CALL``; None: nothing is transferred.
     """
 
     __slots__ = ("_orders", "_references")
@@ -76,7 +76,7 @@ class ExchangeBuffer(Buffer):
         self,
         references: NDArray[np.uint32],
         values: tuple[str, Any],
-        derivatives: tuple[str, Any],
+        derivatives: tuple[str, Any] | None,
     ) -> None:
         n = len(references)
         super().__init__(n)
@@ -84,13 +84,36 @@ class ExchangeBuffer(Buffer):
         self._orders = np.repeat(np.arange(1, MAX_ORDER + 1, dtype=np.int32), n)
         of, address = self._references.ctypes.data, self.rows.ctypes.data
         self.values_function, get_or_set = values
-        self.derivatives_function, get_or_set_derivatives = derivatives
         self.transfer_values = partial(get_or_set, of, n, address)
+        if derivatives is None:
+            return
+        self.derivatives_function, get_or_set_derivatives = derivatives
         order_numbers, row_1 = self._orders.ctypes.data, address + n * self.rows.itemsize
         self.transfer_derivatives = [
             partial(get_or_set_derivatives, of, k * n, order_numbers, row_1)
             for k in range(MAX_ORDER + 1)
         ]
+
+
+class InputPolynomials:
+    """Inputs of an FMU that are set along their polynomials at times within a step.
+
+    Args:
+        given: holds the derivatives of all orders that are set, and zeros above.
+        within: transfers values of the same variables.
+    """
+
+    def __init__(self, given: Buffer, within: Buffer) -> None:
+        self._given = given
+        self._within = within
+        self.values_function = within.values_function
+
+    def set(self, rows: int, offset: float) -> int:
+        """Set the inputs of ``rows`` derivatives at ``offset`` [s] from where they were given."""
+        if self._within.size == 0:
+            return 0
+        self._within.rows[0] = InputSignal(self._given.first[rows]).at(offset)
+        return self._within.transfer_values()
 
 
 VALUES_CALL_3 = [*VALUES_CALL, ctypes.c_size_t]
@@ -138,6 +161,7 @@ class ArrayExchangeBuffer(Buffer):
         places: of the scalar variables.
         function: gives the function of a full name and argument types, with the component bound.
         sets: whether the FMU is to take the values (inputs) or to give them (outputs).
+        derivatives: whether outputs have them.
     """
 
     __slots__ = ("_kept", "_wholes")
@@ -148,6 +172,7 @@ class ArrayExchangeBuffer(Buffer):
         function: Callable[[str, Sequence[Any]], Any],
         *,
         sets: bool,
+        derivatives: bool,
     ) -> None:
         n = len(places)
         super().__init__(n)
@@ -176,9 +201,7 @@ class ArrayExchangeBuffer(Buffer):
                     transfer = function(f"{verb}{kind}", VALUES_CALL_3)
                     self._wholes.append((whole, whole.call(get), whole.call(transfer)))
             self.transfer_values = self._set if sets else self._get
-        if sets:
-            self.transfer_derivatives = [_nothing] * (MAX_ORDER + 1)
-        else:
+        if derivatives:
             get_derivatives = function(self.derivatives_function, DERIVATIVES_CALL_3)
             self.transfer_derivatives = self._derivatives(places, get_derivatives)
 
@@ -232,7 +255,7 @@ class ArrayExchangeBuffer(Buffer):
 
 
 def _nothing() -> int:
-    """FMI 3.0 sets no derivatives of inputs."""
+    """For values that are not transferred."""
     return 0
 
 

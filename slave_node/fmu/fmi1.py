@@ -25,9 +25,9 @@ from protocol.calls import StepResult
 from protocol.errors import StepRejectedError
 from protocol.signals import FloatArray
 from protocol.slave import StartValue, StepStatus, VariableType
-from slave_node.fmu.co_simulation import CoSimulationSlave
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import DERIVATIVES_CALL, VALUES_CALL, ExchangeBuffer
+from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, reference_array
 from slave_node.fmu.log import LOGGER_1, add_proxy, instantiating, register, unregister
 from slave_node.fmu.values import ValueType
@@ -82,7 +82,7 @@ class Fmi1Instance(FmuInstance):
         unregister(self.log)
 
 
-class Fmi1Slave(CoSimulationSlave):
+class Fmi1Slave(FmuSlave):
     """One instance of an FMI 1.0 co-simulation FMU.
 
     In initialization mode outputs are start values. Where the FMU says none for one that is asked

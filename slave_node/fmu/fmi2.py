@@ -18,9 +18,9 @@ from fmpy.fmi2 import (
 from protocol.calls import StepResult
 from protocol.errors import StepRejectedError
 from protocol.slave import StartValue, StepStatus, VariableType
-from slave_node.fmu.co_simulation import CoSimulationSlave
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import DERIVATIVES_CALL, VALUES_CALL, ExchangeBuffer
+from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, reference_array
 from slave_node.fmu.log import LOGGER_2, add_proxy, register, unregister, wanted_categories
 from slave_node.fmu.values import ValueType
@@ -94,13 +94,21 @@ class Fmi2Instance(FmuInstance):
         self.set_values(at_once)
         self.call(fmu.enterInitializationMode)
 
+    def buffer(self, names: Sequence[str], values: str, derivatives: str = "") -> ExchangeBuffer:
+        """For these variables, with the functions of these names."""
+        return ExchangeBuffer(
+            reference_array(self.continuous_places(names)),
+            (values, self.function(values, VALUES_CALL)),
+            (derivatives, self.function(derivatives, DERIVATIVES_CALL)) if derivatives else None,
+        )
+
     def close(self) -> None:
         """See `FmuInstance`."""
         super().close()
         unregister(self.log)
 
 
-class Fmi2Slave(CoSimulationSlave):
+class Fmi2Slave(FmuSlave):
     """One instance of an FMI 2.0 co-simulation FMU.
 
     Args:
@@ -123,16 +131,9 @@ class Fmi2Slave(CoSimulationSlave):
         """Make the buffers for these inputs and outputs."""
         instance = self._fmi2
 
-        def buffer(names: Sequence[str], values: str, derivatives: str) -> ExchangeBuffer:
-            return ExchangeBuffer(
-                reference_array(instance.continuous_places(names)),
-                (values, instance.function(values, VALUES_CALL)),
-                (derivatives, instance.function(derivatives, DERIVATIVES_CALL)),
-            )
-
         self._rows_set = 1
-        self._inputs = buffer(inputs, "fmi2SetReal", "fmi2SetRealInputDerivatives")
-        self._outputs = buffer(outputs, "fmi2GetReal", "fmi2GetRealOutputDerivatives")
+        self._inputs = instance.buffer(inputs, "fmi2SetReal", "fmi2SetRealInputDerivatives")
+        self._outputs = instance.buffer(outputs, "fmi2GetReal", "fmi2GetRealOutputDerivatives")
 
     def initialize(
         self,

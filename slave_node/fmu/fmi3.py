@@ -12,15 +12,16 @@ from fmpy.fmi3 import FMU3Slave
 
 from protocol.calls import StepResult
 from protocol.errors import SlaveError, StepRejectedError
-from protocol.signals import FloatArray, InputSignal
+from protocol.signals import FloatArray
 from protocol.slave import StartValue, StepStatus, VariableType
 from slave_node.fmu.archive import PLATFORM_FOLDERS
-from slave_node.fmu.co_simulation import CoSimulationSlave
 from slave_node.fmu.description import FmuModel
-from slave_node.fmu.exchange import VALUES_CALL_3, ArrayExchangeBuffer
+from slave_node.fmu.exchange import VALUES_CALL_3, ArrayExchangeBuffer, InputPolynomials
+from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import ADDRESS, DISCARD, ERROR, WARNING, FmuInstance
 from slave_node.fmu.log import FmuLog, wanted_categories
 from slave_node.fmu.saved_state import SavedState, pack, unpack
+from slave_node.fmu.times import meet
 from slave_node.fmu.values import ValueType
 
 MAX_EVENTS = 10_000
@@ -107,6 +108,13 @@ class Fmi3Instance(FmuInstance):
         )
         self.set_values(later)
 
+    def buffer(
+        self, names: Sequence[str], *, sets: bool = False, derivatives: bool = False
+    ) -> ArrayExchangeBuffer:
+        """For these variables, see `ArrayExchangeBuffer`."""
+        places = self.continuous_places(names)
+        return ArrayExchangeBuffer(places, self.function, sets=sets, derivatives=derivatives)
+
     def update_discrete_states(self) -> tuple[bool, bool, bool]:
         """In event mode, fmi3UpdateDiscreteStates until there is nothing more to update.
 
@@ -163,7 +171,7 @@ class _SlaveInstance(Fmi3Instance):
         )
 
 
-class Fmi3Slave(CoSimulationSlave):
+class Fmi3Slave(FmuSlave):
     """One instance of an FMI 3.0 co-simulation FMU.
 
     Event mode is used where the FMU has it. An event within a step is handled and the step goes on
@@ -204,14 +212,11 @@ class Fmi3Slave(CoSimulationSlave):
         """Make the buffers for these inputs and outputs."""
         instance = self._fmi3
 
-        def buffer(names: Sequence[str], *, sets: bool) -> ArrayExchangeBuffer:
-            places = instance.continuous_places(names)
-            return ArrayExchangeBuffer(places, instance.function, sets=sets)
-
         self._rows_set = 1
-        self._inputs = buffer(inputs, sets=True)
-        self._inputs_within = buffer(inputs, sets=True)
-        self._outputs = buffer(outputs, sets=False)
+        self._inputs = instance.buffer(inputs, sets=True)
+        self._inputs_within = instance.buffer(inputs, sets=True)
+        self._polynomials = InputPolynomials(self._inputs, self._inputs_within)
+        self._outputs = instance.buffer(outputs, derivatives=self._max_order > 0)
 
     def _start(self, time: float, *, early_return: bool) -> None:
         self._time = self._inputs_time = time
@@ -294,13 +299,12 @@ class Fmi3Slave(CoSimulationSlave):
     ) -> None:
         """Called by the FMU within a step: set the inputs along their polynomials."""
         return_requested[0] = False
-        if not set_requested or not self._inputs.size or self._failure is not None:
+        if not set_requested or self._failure is not None:
             return
         try:
-            within = self._inputs_within
-            signal = InputSignal(self._inputs.first[self._rows_set])
-            within.rows[0] = signal.at(time - self._inputs_time)
-            self._fmi3.check(within.values_function, within.transfer_values())
+            polynomials = self._polynomials
+            status = polynomials.set(self._rows_set, time - self._inputs_time)
+            self._fmi3.check(polynomials.values_function, status)
         except Exception as error:  # nothing may go through the FMU
             self._failure = error
 
@@ -312,7 +316,7 @@ class Fmi3Slave(CoSimulationSlave):
         time, h = communication_point, step_size
         for _ in range(MAX_EVENTS):
             reached, has_event = end, self._fmi3.next_event_time <= end
-            if has_event and not _meet(self._fmi3.next_event_time, end):
+            if has_event and not meet(self._fmi3.next_event_time, end):
                 reached = max(self._fmi3.next_event_time, time)
                 h = reached - time
             if h > 0.0:
@@ -321,12 +325,12 @@ class Fmi3Slave(CoSimulationSlave):
                     return result
                 has_event = self._event.value or (has_event and not self._early.value)
                 reached = self._reached.value if self._early.value else reached
-            if _meet(reached, end):
+            if meet(reached, end):
                 self._time = end
                 ends = has_event and self._has_event_mode and self._handle_event()
                 return StepResult(StepStatus.TERMINATED if ends else _STEP_OK, end)
             self._time = reached
-            if self._returns_early and not _meet(reached, communication_point):
+            if self._returns_early and not meet(reached, communication_point):
                 return StepResult(StepStatus.EARLY_RETURN, reached)
             if has_event and self._has_event_mode and self._handle_event():
                 return StepResult(StepStatus.TERMINATED, reached)
@@ -386,8 +390,3 @@ class Fmi3Slave(CoSimulationSlave):
         if not isinstance(state, SavedState):
             raise SlaveError(f"not a saved state of {self.description.model}: {type(state)}")
         return state
-
-
-def _meet(one: float, other: float) -> bool:
-    """Whether two times [s] differ by nothing but rounding."""
-    return abs(one - other) <= 4.0 * math.ulp(max(abs(one), abs(other)))

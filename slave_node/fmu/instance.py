@@ -142,10 +142,7 @@ class FmuInstance(ABC):
         return f"it needs {tool} installed on this host"
 
     def _load_functions(self) -> None:
-        self.saves_state = bool(self.state_functions[0]) and (
-            self.model.description.capabilities.can_get_and_set_state
-        )
-        if self.saves_state:
+        if self.model.interface.saves_state:
             get, set_, free = (self.function(n, [ADDRESS]) for n in self.state_functions)
             self.get_fmu_state: Callable[..., int] = get
             self.set_fmu_state: Callable[..., int] = set_
@@ -289,7 +286,7 @@ class FmuInstance(ABC):
 
     def require_state(self) -> None:
         """SlaveError if the FMU cannot save its state."""
-        if not self.saves_state:
+        if not self.model.description.capabilities.can_get_and_set_state:
             raise SlaveError(f"the FMU {self.model.description.model} cannot save its state")
 
     def get_state(self) -> ctypes.c_void_p:

@@ -26,6 +26,9 @@ class Interface:
         fixed_step_size: the only communication step size that it takes [s], None: any.
         needs_execution_tool: whether it is only an adapter to a tool.
         has_event_mode: FMI 3.0, co-simulation.
+        saves_state: whether the FMU itself saves its state.
+        continuous_states, event_indicators: how many there are (model exchange of FMI 2.0; FMI 3.0
+            says it when it runs).
         needs_completed_step: fmi2CompletedIntegratorStep, fmi3CompletedIntegratorStep.
         intermediate_inputs: value references of inputs that are set within a step (FMI 3.0).
     """
@@ -38,6 +41,9 @@ class Interface:
     fixed_step_size: float | None = None
     needs_execution_tool: bool = False
     has_event_mode: bool = False
+    saves_state: bool = False
+    continuous_states: int = 0
+    event_indicators: int = 0
     needs_completed_step: bool = True
     intermediate_inputs: tuple[int, ...] = ()
 
@@ -91,6 +97,7 @@ def interface_2(model_description: Any, root: Element) -> Interface:
     has_variable_steps = bool(slave.canHandleVariableCommunicationStepSize)
     return Interface(
         version=2,
+        saves_state=bool(slave.canGetAndSetFMUstate),
         is_model_exchange=False,
         model_identifier=slave.modelIdentifier,
         capabilities=Capabilities(
@@ -120,6 +127,7 @@ def interface_3(model_description: Any, root: Element) -> Interface:
     intermediate = _intermediate_inputs(root) if slave.providesIntermediateUpdate else ()
     return Interface(
         version=3,
+        saves_state=bool(slave.canGetAndSetFMUstate),
         is_model_exchange=False,
         model_identifier=slave.modelIdentifier,
         capabilities=Capabilities(
@@ -169,6 +177,9 @@ def _model_exchange(version: int, model_description: Any) -> Interface:
         ),
         input_derivatives=InputDerivatives.NATIVE,
         needs_execution_tool=bool(model.needsExecutionTool),
+        saves_state=bool(model.canGetAndSetFMUstate),
+        continuous_states=int(model_description.numberOfContinuousStates),
+        event_indicators=int(model_description.numberOfEventIndicators or 0),
         needs_completed_step=bool(model.needsCompletedIntegratorStep),
     )
 

@@ -1,4 +1,4 @@
-"""What FMUs for co-simulation have in common as slaves, whatever their version of FMI.
+"""What FMUs have in common as slaves, whatever their version of FMI and their interface.
 
 Arrays go to and come from buffers that are made once, so that the hot path neither allocates in
 C types nor loops over variables in Python.
@@ -15,8 +15,8 @@ from slave_node.fmu.exchange import Buffer
 from slave_node.fmu.instance import FmuInstance
 
 
-class CoSimulationSlave(Slave):
-    """One instance of a co-simulation FMU.
+class FmuSlave(Slave):
+    """One instance of an FMU.
 
     A subclass makes the buffers and says how to initialize and to step.
 
