@@ -81,7 +81,7 @@ def check_binary(fmu: Path, directory: Path, model_identifier: str, folder: str)
     """
     if not _IDENTIFIER.fullmatch(model_identifier):
         raise ModelError(f"{fmu}: modelIdentifier {model_identifier!r:.60} is not a file name")
-    binary = directory / "binaries" / folder / (model_identifier + sharedLibraryExtension)
+    binary: Path = directory / "binaries" / folder / (model_identifier + sharedLibraryExtension)
     if not binary.is_file():
         with zipfile.ZipFile(fmu) as archive:
             parts = [PurePosixPath(name).parts for name in archive.namelist()]

@@ -21,11 +21,11 @@ from fmpy.sundials import (
     SUNErrHandlerFn,
     SUNLinSol_Dense,
 )
+from fmpy.sundials import cvode as bindings
 from fmpy.sundials.cvode import (
     CV_BDF,
     CV_ROOT_RETURN,
     CV_SUCCESS,
-    CVode as _cvode,
     CVodeCreate,
     CVodeFree,
     CVodeInit,
@@ -166,7 +166,7 @@ class CVode:
         time = ctypes.c_double()
         memory = self._memory
         self._require(_set_stop_time(memory, stop_time))
-        flag = _cvode(memory, stop_time, self._states, ctypes.byref(time), _ONE_STEP)
+        flag = bindings.CVode(memory, stop_time, self._states, ctypes.byref(time), _ONE_STEP)
         if flag < CV_SUCCESS:
             raise self._error(flag)
         if not np.isfinite(self.x).all():

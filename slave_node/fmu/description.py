@@ -83,8 +83,17 @@ def read_fmu(
         root = ElementTree.parse(directory / "modelDescription.xml").getroot()
         read_interface = _version(root)
         model_description = read_model_description(str(directory), validate=False)
-        return _read(
-            fmu, directory, model_description, root, read_interface, structural_parameters or {}
+        interface = read_interface(model_description, root)
+        variables = read_variables(model_description, root, structural_parameters or {})
+        return FmuModel(
+            fmu,
+            directory,
+            _description(fmu, model_description, root, interface, variables),
+            interface,
+            variables.places,
+            structural_parameters or {},
+            model_description.guid or "",
+            tuple(category.name for category in model_description.logCategories),
         )
     except ModelError as error:
         raise ModelError(f"{fmu}: {error.cause}", remedy=error.remedy) from error
@@ -109,20 +118,13 @@ def _version(root: Element) -> Callable[[Any, Element], Interface]:
         ) from None
 
 
-def _read(
-    fmu: Path,
-    directory: Path,
-    model_description: Any,
-    root: Element,
-    read_interface: Callable[[Any, Element], Interface],
-    structural_parameters: Mapping[str, StartValue],
-) -> FmuModel:
-    interface = read_interface(model_description, root)
-    variables = read_variables(model_description, root, structural_parameters)
+def _description(
+    fmu: Path, model_description: Any, root: Element, interface: Interface, variables: Variables
+) -> SlaveDescription:
     saves_state = interface.capabilities.can_get_and_set_state
     feed_through = _feed_through(model_description, root, variables, interface.version)
     initial = _dependencies(model_description.initialUnknowns, variables)
-    description = SlaveDescription(
+    return SlaveDescription(
         model=model_description.modelName,
         kind=interface.kind,
         variables=variables.scalars,
@@ -139,16 +141,6 @@ def _read(
         sha256=hashlib.sha256(fmu.read_bytes()).hexdigest(),
         guid=model_description.guid or "",
         generation_tool=model_description.generationTool or "",
-    )
-    return FmuModel(
-        fmu,
-        directory,
-        description,
-        interface,
-        variables.places,
-        structural_parameters,
-        model_description.guid or "",
-        tuple(category.name for category in model_description.logCategories),
     )
 
 

@@ -224,9 +224,7 @@ class ArrayExchangeBuffer(Buffer):
             worst = max(worst, transfer())
         return worst
 
-    def _derivatives(
-        self, places: Sequence[Place], function: Any
-    ) -> Sequence[Callable[[], int]]:
+    def _derivatives(self, places: Sequence[Place], function: Any) -> Sequence[Callable[[], int]]:
         """All orders in one call; the values are of type Float64 whatever the variables are."""
         whole = _WholeVariables(np.float64, places, range(len(places)))
         n, size = len(whole.references), len(whole.values)
@@ -247,7 +245,7 @@ class ArrayExchangeBuffer(Buffer):
         ]
 
         def transfer(k: int) -> int:
-            status = calls[k]()
+            status: int = calls[k]()
             self.rows[1 : k + 1] = values[:k, whole.elements]
             return status
 

@@ -71,9 +71,7 @@ class Fmi3Instance(FmuInstance):
 
     def _instantiate(self, *, log_all: bool) -> None:
         wanted = wanted_categories(list(self.model.log_categories), log_all=log_all)
-        self._instantiate_interface(
-            loggingOn=log_all or bool(wanted), logMessage=_logger(self.log)
-        )
+        self._instantiate_interface(loggingOn=log_all or bool(wanted), logMessage=_logger(self.log))
         if wanted:
             self.fmu.setDebugLogging(True, wanted)
 
@@ -196,9 +194,14 @@ class Fmi3Slave(FmuSlave):
         super().__init__(self._fmi3)
         self._has_event_mode = model.interface.has_event_mode
         self._follows_inputs = bool(model.interface.intermediate_inputs)
-        self._event, self._end, self._early = flags = [ctypes.c_bool() for _ in range(3)]
+        self._event, self._end, self._early = (ctypes.c_bool() for _ in range(3))
         self._reached = ctypes.c_double()
-        results = [ctypes.addressof(result) for result in (*flags, self._reached)]
+        results = [
+            ctypes.addressof(self._event),
+            ctypes.addressof(self._end),
+            ctypes.addressof(self._early),
+            ctypes.addressof(self._reached),
+        ]
         fmi3_do_step = self._fmi3.function(
             "fmi3DoStep", [ctypes.c_double, ctypes.c_double, ctypes.c_bool, *[ADDRESS] * 4]
         )
@@ -370,7 +373,7 @@ class Fmi3Slave(FmuSlave):
         self._fmi3.set_state(saved.fmu)
         self._time, self._inputs_time, self._fmi3.next_event_time, rows = saved.numbers[:4].tolist()
         self._rows_set = int(rows)
-        self._inputs.rows.flat = saved.numbers[4:]
+        self._inputs.rows[...] = saved.numbers[4:].reshape(self._inputs.rows.shape)
 
     def free_state(self, state: object) -> None:
         """See `Slave`."""

@@ -167,9 +167,8 @@ def _model_exchange(version: int, model_description: Any) -> Interface:
         model_identifier=model.modelIdentifier,
         capabilities=Capabilities(
             can_get_and_set_state=saves_state,
-            can_serialize_state=bool(model.canSerializeFMUstate) or (
-                saves_state and not model.canGetAndSetFMUstate
-            ),
+            can_serialize_state=bool(model.canSerializeFMUstate)
+            or (saves_state and not model.canGetAndSetFMUstate),
             can_interpolate_inputs=True,
             max_output_derivative_order=0,
             can_handle_variable_step_size=True,
@@ -209,5 +208,3 @@ def _intermediate_inputs(root: Element) -> tuple[int, ...]:
 
 def _native(is_native: bool) -> InputDerivatives:
     return InputDerivatives.NATIVE if is_native else InputDerivatives.NONE
-
-

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from protocol.errors import ModelError
 from protocol.slave import Slave, StartValue
-from slave_node.fmu.description import read_fmu
+from slave_node.fmu.description import FmuModel, read_fmu
 from slave_node.fmu.fmi1 import Fmi1Slave
 from slave_node.fmu.fmi2 import Fmi2Slave
 from slave_node.fmu.fmi3 import Fmi3Slave
-from slave_node.fmu.model_exchange import model_exchange_2, model_exchange_3
-
-_ADAPTERS: Mapping[str, Callable[..., Slave]] = {
-    "FMI 1.0 co-simulation": Fmi1Slave,
-    "FMI 2.0 co-simulation": Fmi2Slave,
-    "FMI 3.0 co-simulation": Fmi3Slave,
-    "FMI 2.0 model exchange": model_exchange_2,
-    "FMI 3.0 model exchange": model_exchange_3,
-}
 
 
 def load_fmu(
@@ -43,4 +36,23 @@ def load_fmu(
             parameter.
     """
     model = read_fmu(fmu, directory, structural_parameters)
-    return _ADAPTERS[model.interface.kind](model, name, log_all=log_all)
+    for remark in model.description.remarks:
+        logging.getLogger(__name__).warning("%s: %s", name, remark)
+    if model.interface.is_model_exchange:
+        return _model_exchange(model, name, log_all=log_all)
+    return _CO_SIMULATION[model.interface.version](model, name, log_all=log_all)
+
+
+_CO_SIMULATION: Mapping[int, Callable[..., Slave]] = {1: Fmi1Slave, 2: Fmi2Slave, 3: Fmi3Slave}
+
+
+def _model_exchange(model: FmuModel, name: str, *, log_all: bool) -> Slave:
+    try:
+        from slave_node.fmu import model_exchange  # noqa: PLC0415  others need no SUNDIALS
+    except OSError as error:
+        raise ModelError(
+            f"{model.fmu}: {model.interface.kind} needs SUNDIALS, which FMPy does not bring for "
+            f"this platform: {error}",
+            remedy="export it as co-simulation",
+        ) from error
+    return model_exchange.ADAPTERS[model.interface.version](model, name, log_all=log_all)

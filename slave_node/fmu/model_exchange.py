@@ -7,7 +7,7 @@ depends on nothing but the state at its beginning, and a restored state repeats 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from protocol.calls import StepResult
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
-from protocol.slave import StartValue, StepStatus
+from protocol.slave import Slave, StartValue, StepStatus
 from slave_node.fmu.continuous_model import ContinuousModel, Fmi2Model, Fmi3Model
 from slave_node.fmu.cvode import CVode, Outcome
 from slave_node.fmu.description import FmuModel
@@ -36,16 +36,6 @@ MAX_EVENTS = 10_000
 
 _STEPS_WITHOUT_STATES = 20
 """Internal steps in a communication step of a model that has indicators and no states."""
-
-
-def model_exchange_2(model: FmuModel, name: str, *, log_all: bool = False) -> ModelExchangeSlave:
-    """A slave for an FMU of FMI 2.0, see `ModelExchangeSlave`."""
-    return ModelExchangeSlave(Fmi2Model(model, name, log_all=log_all))
-
-
-def model_exchange_3(model: FmuModel, name: str, *, log_all: bool = False) -> ModelExchangeSlave:
-    """A slave for an FMU of FMI 3.0, see `ModelExchangeSlave`."""
-    return ModelExchangeSlave(Fmi3Model(model, name, log_all=log_all))
 
 
 class ModelExchangeSlave(FmuSlave):
@@ -281,7 +271,7 @@ class ModelExchangeSlave(FmuSlave):
         self._time, self._inputs_time, next_event_time, rows_set, self._first_step = times.tolist()
         self._model.next_event_time = next_event_time
         self._rows_set = int(rows_set)
-        self._inputs.rows.flat = rows
+        self._inputs.rows[...] = rows.reshape(self._inputs.rows.shape)
         if self._saves_by_fmu:
             self._model.set_state(saved.fmu)
         else:
@@ -318,3 +308,14 @@ class ModelExchangeSlave(FmuSlave):
             self._solver.close()
             self._solver = None
         super().close()
+
+
+def _adapter(instance: type[ContinuousModel]) -> Callable[..., Slave]:
+    def load(model: FmuModel, name: str, *, log_all: bool = False) -> Slave:
+        return ModelExchangeSlave(instance(model, name, log_all=log_all))
+
+    return load
+
+
+ADAPTERS: Mapping[int, Callable[..., Slave]] = {2: _adapter(Fmi2Model), 3: _adapter(Fmi3Model)}
+"""By major version of FMI: from the FMU, an instance name and ``log_all`` to the slave."""

@@ -77,18 +77,14 @@ class ValueGroup(ABC):
     def receive(self) -> None:
         """Get all from the FMU."""
         arrays = self._arrays()
-        self._caller.exchange(
-            f"Get{self._function}", self._references, arrays, len(self.raw)
-        )
+        self._caller.exchange(f"Get{self._function}", self._references, arrays, len(self.raw))
         self.raw = self._read(arrays)
 
     def send(self) -> None:
         """Set all in the FMU."""
         arrays = self._arrays()
         kept = self._write(arrays)
-        self._caller.exchange(
-            f"Set{self._function}", self._references, arrays, len(self.raw)
-        )
+        self._caller.exchange(f"Set{self._function}", self._references, arrays, len(self.raw))
         del kept
 
     def put(self, values: Sequence[StartValue]) -> None:
@@ -294,7 +290,7 @@ def _checked(
             raise error(f"{name!r} cannot be NaN")
         return float(value)
     accepted = _ACCEPTED.get(kind, int)
-    is_within = not (bounds and type(value) is int) or bounds[0] <= value <= bounds[1]  # type: ignore[operator]
+    is_within = not (bounds and type(value) is int) or bounds[0] <= value <= bounds[1]
     if type(value) is accepted and is_within and not (accepted is str and "\0" in str(value)):
         return value
     limits = f", {bounds[0]} to {bounds[1]}" if bounds else ""

@@ -176,7 +176,7 @@ def _texts(declared: Any, size: int) -> list[str]:
 
 def _starts(kind: str, texts: list[str], size: int) -> list[StartValue | None]:
     """One for each element; None where the FMU says none, or says them for another size."""
-    values = [_PARSERS.get(kind, int)(text) for text in texts]
+    values: list[StartValue | None] = [_PARSERS.get(kind, int)(text) for text in texts]
     if len(values) == 1:
         return values * size
     return values if len(values) == size else [None] * size
@@ -198,9 +198,7 @@ _PARSERS: Mapping[str, Callable[[str], StartValue]] = {
 """All others are integers."""
 
 
-def _variable(
-    declared: Any, name: str, kind: VariableType, start: StartValue | None
-) -> Variable:
+def _variable(declared: Any, name: str, kind: VariableType, start: StartValue | None) -> Variable:
     declared_type = declared.declaredType
     unit = declared.unit or (declared_type.unit if declared_type else None)
     nominal = declared.nominal or (declared_type.nominal if declared_type else None)
