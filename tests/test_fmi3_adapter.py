@@ -78,7 +78,7 @@ def started(slave: Slave, **arguments: object) -> Slave:
 
 def half_of_a_car(load: Load, name: str) -> Slave:
     """A half of the quarter car with inputs and outputs, disturbed."""
-    inputs = CONTINUOUS[name.split("_")[0]]
+    inputs = CONTINUOUS[name.partition("_")[0]]
     return started(load(name), inputs=inputs, outputs=("x", "v"), start_values={"x": 0.1})
 
 
@@ -205,7 +205,7 @@ def test_intermediate_updates_follow_the_polynomial(load: Load, order: int) -> N
     for one in (slave, exact, lower):
         assert one.do_step(0.0, 0.08, False) == (StepStatus.OK, 0.08)
         outputs.append(one.get_outputs(0)[0])
-    np.testing.assert_allclose(outputs[0], outputs[1], rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(outputs[0], outputs[1], rtol=1e-6, atol=2e-7)
     assert np.abs(outputs[0] - outputs[2]).max() > 1e-6
 
 
@@ -263,14 +263,12 @@ def test_values_of_all_types_make_the_round_trip(load: Load) -> None:
         discrete_inputs=[f"{name}_in" for name in names],
         discrete_outputs=[f"{name}_out" for name in names],
     )
-    for _ in range(2):  # in initialization mode, and behind it
-        slave.set_discrete_inputs([SCALARS[name][0] for name in names])
-        values = slave.get_discrete_outputs()
-        assert list(values) == [SCALARS[name][1] for name in names]
-        assert [type(value) for value in values] == [type(SCALARS[name][1]) for name in names]
-        slave.exit_initialization_mode()
-        slave.set_discrete_inputs([_other(SCALARS[name][0]) for name in names])
-        break
+    slave.set_discrete_inputs([SCALARS[name][0] for name in names])
+    values = slave.get_discrete_outputs()  # in initialization mode
+    assert list(values) == [SCALARS[name][1] for name in names]
+    assert [type(value) for value in values] == [type(SCALARS[name][1]) for name in names]
+    slave.exit_initialization_mode()
+    slave.set_discrete_inputs([_other(SCALARS[name][0]) for name in names])
     assert slave.get_discrete_outputs() != values
     slave.set_discrete_inputs([SCALARS[name][0] for name in names])
     assert slave.get_discrete_outputs() == values
@@ -349,34 +347,29 @@ def test_a_whole_number_is_no_continuous_variable(load: Load) -> None:
         initialized(load("all_types3"), inputs=("float64_in", "float64_in"))
 
 
+FMI_2: dict[str, tuple[StartValue, StartValue]] = {
+    "integer": (-(2**31), 1 - 2**31),
+    "boolean": (True, False),
+    "string": ("Füße", "got Füße"),
+    "enumeration": (3, 1),
+    "real_discrete": (0.1, 0.2),
+}
+"""What goes in, and what comes out by the FMU's rules."""
+
+
 def test_all_types_of_fmi_2(load: Load) -> None:
     """Integer, Boolean, String, Enumeration and discrete Real make the round trip."""
-    description = load("all_types2").description
-    inputs = [v for v in description.of(Causality.INPUT) if not v.is_continuous_real]
-    values = {
-        VariableType.INTEGER: -(2**31),
-        VariableType.BOOLEAN: True,
-        VariableType.STRING: "Füße",
-        VariableType.ENUMERATION: 2,
-        VariableType.REAL: 0.1,
-    }
-    outputs = [v for v in description.of(Causality.OUTPUT) if not v.is_continuous_real]
-    assert {v.type for v in inputs} >= set(values) - {VariableType.REAL}
     slave = started(
         load("all_types2"),
-        discrete_inputs=[v.name for v in inputs],
-        discrete_outputs=[v.name for v in outputs],
+        discrete_inputs=[f"{name}_in" for name in FMI_2],
+        discrete_outputs=[f"{name}_out" for name in FMI_2],
     )
-    slave.set_discrete_inputs([values[v.type] for v in inputs])
-    seen = {v.type: value for v, value in zip(outputs, slave.get_discrete_outputs(), strict=True)}
-    assert seen[VariableType.INTEGER] == 1 - 2**31
-    assert seen[VariableType.BOOLEAN] is False
-    assert seen[VariableType.STRING] == "got Füße"
-    assert seen[VariableType.ENUMERATION] == 3
+    slave.set_discrete_inputs([value for value, _ in FMI_2.values()])
+    assert list(slave.get_discrete_outputs()) == [value for _, value in FMI_2.values()]
     with pytest.raises(SlaveError, match="-2147483648 to 2147483647; it cannot be 2147483648"):
-        slave.set_discrete_inputs(
-            [2**31 if v.type is VariableType.INTEGER else values[v.type] for v in inputs]
-        )
+        slave.set_discrete_inputs((2**31, False, "", 1, 0.0))
+    with pytest.raises(SlaveError, match="'enumeration_in' is of type Enumeration"):
+        slave.set_discrete_inputs((1, False, "", 2**31, 0.0))
 
 
 # ---- Arrays and structural parameters ----------------------------------------------------------

@@ -22,7 +22,7 @@ from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import InputPolynomials
 from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.saved_state import SavedState, pack, unpack
-from slave_node.fmu.times import meet
+from slave_node.fmu.times import ReportedEvent, meet
 
 DEFAULT_TOLERANCE = 1e-6
 MIN_TOLERANCE = 1e-13
@@ -64,9 +64,10 @@ class ModelExchangeSlave(FmuSlave):
         self._outputs = self._model.buffers(outputs, sets=False)
 
     def _start(self, time: float, tolerance: float | None, *, early_return: bool) -> None:
-        self._time = self._inputs_time = time
+        self._time = self._inputs_time = self._model_time = time
         self._tolerance = max(tolerance or DEFAULT_TOLERANCE, MIN_TOLERANCE)
         self._returns_early = early_return
+        self._reported = ReportedEvent()
         self._is_initializing = True
         self._rows_set = 1
         self._first_step = 0.0
@@ -188,25 +189,49 @@ class ModelExchangeSlave(FmuSlave):
             raise SlaveError(f"a step of {step_size!r} s does not advance the time {begin!r} s")
         if not meet(begin, self._time):
             raise SlaveError(f"a step from {begin!r} s, but the slave stands at {self._time!r} s")
-        time = begin
+        time = max(begin, self._model_time)
         if self._inputs_made_event() and self._handle_event():
             return StepResult(StepStatus.TERMINATED, time)
+        is_expected = self._returns_early and meet(end, self._reported.time)
         for _ in range(MAX_EVENTS):
             stop = max(min(end, self._model.next_event_time), time)
             time, has_event, ends = self._integrate(time, stop, step_size, no_set_state_prior)
-            is_last = meet(time, end)
-            time = end if is_last else time
-            self._time = time
+            is_last = time >= end or meet(time, end)
+            self._model_time, self._time = time, end if is_last else time
             if ends:
-                return StepResult(StepStatus.TERMINATED, time)
-            if has_event and self._returns_early and not is_last and not meet(time, begin):
-                return StepResult(StepStatus.EARLY_RETURN, time)
+                return StepResult(StepStatus.TERMINATED, self._time)
+            if has_event and self._returns_early and not is_last:
+                if not self._reported.is_expected(time, begin, end):
+                    self._reported.report(time, begin)
+                    return StepResult(StepStatus.EARLY_RETURN, time)
+                is_expected = False
+            if is_last and is_expected and not has_event:
+                has_event = self._reach_expected_event(time, step_size)
             if has_event and self._handle_event():
-                return StepResult(StepStatus.TERMINATED, time)
+                return StepResult(StepStatus.TERMINATED, self._time)
             if is_last:
                 self._indicators = self._model.vector("indicators", self._indicator_count)
                 return StepResult(StepStatus.OK, end)
         raise StepRejectedError(f"more than {MAX_EVENTS} events in one step")
+
+    def _reach_expected_event(self, time: float, step_size: float) -> bool:
+        """Whether the event that was reported for ``time`` comes just behind it.
+
+        The FMU then stands at the event, a bit ahead of the communication point.
+        """
+        state = self.get_state()
+        ahead, has_event, _ = self._integrate(
+            time,
+            time + self._reported.slack,
+            step_size,
+            no_set_state_prior=False,
+        )
+        if has_event:
+            self._model_time = ahead
+        else:
+            self.set_state(state)
+        self.free_state(state)
+        return has_event
 
     def _integrate(
         self, time: float, stop: float, step_size: float, no_set_state_prior: bool
@@ -254,7 +279,7 @@ class ModelExchangeSlave(FmuSlave):
         self._model.require_state()
         numbers = np.concatenate(
             [
-                (self._time, self._inputs_time, self._model.next_event_time),
+                (self._time, self._model_time, self._inputs_time, self._model.next_event_time),
                 (self._rows_set, self._first_step),
                 self._model.vector("states", self._size),
                 self._indicators,
@@ -267,15 +292,15 @@ class ModelExchangeSlave(FmuSlave):
         """See `Slave`."""
         saved = self._checked(state)
         n, n_z = self._size, self._indicator_count
-        times, states, self._indicators, rows = np.split(saved.numbers, [5, 5 + n, 5 + n + n_z])
-        self._time, self._inputs_time, next_event_time, rows_set, self._first_step = times.tolist()
-        self._model.next_event_time = next_event_time
+        times, states, self._indicators, rows = np.split(saved.numbers, [6, 6 + n, 6 + n + n_z])
+        self._time, self._model_time, self._inputs_time = times[:3].tolist()
+        self._model.next_event_time, rows_set, self._first_step = times[3:].tolist()
         self._rows_set = int(rows_set)
         self._inputs.rows[...] = rows.reshape(self._inputs.rows.shape)
         if self._saves_by_fmu:
             self._model.set_state(saved.fmu)
         else:
-            self._set_point(self._time, np.ascontiguousarray(states).ctypes.data)
+            self._set_point(self._model_time, np.ascontiguousarray(states).ctypes.data)
 
     def free_state(self, state: object) -> None:
         """See `Slave`."""
@@ -291,7 +316,7 @@ class ModelExchangeSlave(FmuSlave):
 
     def deserialize_state(self, data: bytes) -> object:
         """See `Slave`."""
-        count = 5 + self._size + self._indicator_count + self._inputs.rows.size
+        count = 6 + self._size + self._indicator_count + self._inputs.rows.size
         numbers, fmu = unpack(data, count)
         return SavedState(
             self._model.deserialize_state(fmu) if self._saves_by_fmu else None, numbers
