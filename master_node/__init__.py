@@ -3,6 +3,8 @@
 from master_node.configuration import (
     BusSettings,
     Connection,
+    InputSettings,
+    ResultsSettings,
     SimulationSettings,
     SlaveSettings,
     System,
@@ -10,14 +12,18 @@ from master_node.configuration import (
 )
 from master_node.results import Result
 from master_node.simulation import simulate
+from master_node.system_files import open_system
 
 __all__ = [
     "BusSettings",
     "Connection",
+    "InputSettings",
     "Result",
+    "ResultsSettings",
     "SimulationSettings",
     "SlaveSettings",
     "System",
     "load_system",
+    "open_system",
     "simulate",
 ]

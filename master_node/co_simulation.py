@@ -1,7 +1,8 @@
 """One run of a coupled system: initialize, step to the stop time, terminate.
 
-Nothing here knows where a slave is. The steps themselves are in ``controlled_run.py`` and, without
-an estimator, in ``fixed_run.py``.
+Nothing here knows where a slave is. The steps themselves are in ``controlled_run.py``, with slaves
+of which some have no rollback in ``mixed_run.py``, of which none has in ``defect_run.py``, and,
+without an estimator, in ``fixed_run.py``.
 """
 
 from __future__ import annotations
@@ -13,9 +14,16 @@ import numpy as np
 
 from master_node.configuration import System
 from master_node.controlled_run import ControlledRun
-from master_node.coupling_scheme import CouplingScheme, largest_order, outputs_follow_inputs
+from master_node.coupling_scheme import (
+    CouplingScheme,
+    output_control,
+    outputs_follow_inputs,
+    slaves_without_rollback,
+)
+from master_node.defect_run import DefectRun
 from master_node.fixed_run import FixedRun
 from master_node.initialization import initialize
+from master_node.mixed_run import MixedRun
 from master_node.numerics.error_estimators import ESTIMATORS
 from master_node.observers import Observer, Outcome, RunEnd, RunStart, Statistics
 from master_node.run_context import RunContext
@@ -30,19 +38,22 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
     """What the slaves' capabilities mean for this run, as warnings for the user.
 
     Raises:
-        ConfigurationError: an estimator was asked for and a slave cannot save its state, or
-            cannot change its step size and has no ``step_size`` given.
+        ConfigurationError: an estimator was asked for and a slave cannot change its step size and
+            has no ``step_size`` given, or outputs are to be evaluated again where some slaves have
+            rollback and some have not.
     """
     settings = system.simulation
+    without = slaves_without_rollback(coupled)
+    is_mixed = settings.estimator != "none" and 0 < len(without) < len(coupled.parts)
+    if settings.evaluate_outputs and is_mixed:
+        raise ConfigurationError(
+            f"{coupled.parts[without[0]].name}: its state cannot be saved (canGetAndSetFMUstate), "
+            "so its outputs are not known when those of the others would be evaluated again",
+            remedy="leave out evaluate_outputs",
+        )
     warnings = []
     for part in coupled.parts:
         can = part.description.capabilities
-        if settings.estimator != "none" and not can.can_get_and_set_state:
-            raise ConfigurationError(
-                f"{part.name}: the model cannot save and restore its state "
-                "(canGetAndSetFMUstate), so steps cannot be controlled",
-                remedy="use --estimator none with a fixed --step-size",
-            )
         fixed = system.slaves[part.name].step_size
         if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:
             raise ConfigurationError(
@@ -50,11 +61,16 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
                 remedy=f"give [slaves.{part.name}] step_size, or use --estimator none with a fixed "
                 "--step-size",
             )
-        highest, wanted = largest_order(part), settings.order
-        if part.inputs and (highest < (1 if wanted == "auto" else wanted)):
+        highest, wanted = part.max_order, settings.order
+        if part.connected and (highest < (1 if wanted == "auto" else wanted)):
             warnings.append(
                 f"{part.name} cannot interpolate inputs (canInterpolateInputs): its inputs are "
                 f"held constant in each step, order {highest} instead of {wanted}"
+            )
+        if any(coupled.external.changes[part.external_slice]) and not highest:
+            warnings.append(
+                f"{part.name} cannot interpolate inputs (canInterpolateInputs): its external "
+                "inputs are held at their mean in each step"
             )
         has_feed_through = coupled.feed_through[part.output_slice].any()
         evaluates = settings.evaluate_outputs and has_feed_through
@@ -65,7 +81,26 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
                 f"without a step; if they do, say so: [slaves.{part.name}] "
                 "outputs_follow_inputs = true"
             )
-    return warnings
+    return warnings + _jumps_off_the_grid(coupled, system)
+
+
+def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:
+    """Without an estimator no communication point is put where an external input jumps."""
+    settings = system.simulation
+    if settings.estimator != "none":
+        return []
+    start, stop, step_size = float(settings.start_time), settings.end, settings.step_size
+    inside = [jump for jump in coupled.external.jumps if start < jump.time < stop]
+    steps = np.array([(jump.time - start) / step_size for jump in inside])
+    is_off = np.abs(steps - np.round(steps)) > 1e-9 * np.maximum(1.0, steps)
+    if not is_off.any():
+        return []
+    first = inside[int(np.argmax(is_off))]
+    return [
+        f"{int(is_off.sum())} jumps of external inputs are not at communication points, the first "
+        f"one is that of {first.name} at t={first.time!r} s: in a step over a jump the polynomial "
+        "has the right mean only; choose a step size that meets them, or an estimator"
+    ]
 
 
 @dataclass
@@ -95,7 +130,7 @@ class CoSimulation:
         """
         settings = self.system.simulation
         scheme = CouplingScheme.of(self.coupled, self.system)
-        y = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
+        y = initialize(self.group, self.coupled, self.system, scheme.get_outputs).y
         self.group.restart_statistics()
         statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
         self.observer.started(
@@ -105,6 +140,8 @@ class CoSimulation:
                 float(settings.start_time),
                 settings.end,
                 y[0],
+                output_control(self.coupled, self.system),
+                {part.name: part.description.state_kind for part in self.coupled.parts},
             )
         )
         begin = perf_counter()
@@ -138,6 +175,10 @@ class CoSimulation:
         estimator = ESTIMATORS.get(self.system.simulation.estimator)
         if estimator is None:
             return FixedRun(context).run(y)
+        if len(slaves_without_rollback(self.coupled)) == len(self.coupled.parts):
+            return DefectRun(context).run(y)
+        if scheme.late_slaves:
+            return MixedRun(context, estimator).run(y)
         return ControlledRun(context, estimator).run(y)
 
     def _terminate(self, time: float) -> None:

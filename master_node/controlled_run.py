@@ -1,6 +1,6 @@
 """A run with error-controlled step sizes: attempt -> judge -> accept or go back.
 
-What is tried next is a value (`_Position`), so a rejected step is one that is not put in its place.
+What is tried next is a value (`Position`), so a rejected step is one that is not put in its place.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials
 from master_node.numerics.initial_step_size import initial_step_size, trial_step_size
+from master_node.numerics.landing_points import LandingPoints
 from master_node.numerics.order_control import DEPTH, OrderMemory
 from master_node.numerics.step_size_controller import (
     EXPONENTS,
@@ -35,7 +36,7 @@ from master_node.order_selection import OrderSelection
 from master_node.result_points import Reached, ResultPoints, count_accepted
 from master_node.run_context import RunContext
 from master_node.step_requests import FailedStep
-from master_node.step_size_rules import step_size_limits
+from master_node.step_size_rules import crossings, step_size_limits
 from protocol.errors import DoublestepError, StepSizeError
 from protocol.signals import FloatArray
 from protocol.slave import StepStatus
@@ -45,7 +46,7 @@ _TRIALS = 5
 
 
 @dataclass(frozen=True, slots=True)
-class _Position:
+class Position:
     """Where a run stands and what it will try next.
 
     Attributes:
@@ -70,6 +71,7 @@ class _Position:
 
     @property
     def time(self) -> float:
+        """T_n [s]."""
         return self.history.times[0]
 
 
@@ -88,14 +90,19 @@ class ControlledRun:
         settings, coupled, scheme = context.system.simulation, context.coupled, context.scheme
         self._settings = settings
         self._start = float(settings.start_time)
-        self._source = coupled.source
+        self._coupled = coupled
         self._scheme = scheme
         self._observer = context.observer
         self._statistics = context.statistics
         self._estimator = estimator
         self._limits = step_size_limits(context.system)
-        self._stepper = DoubleStepper(context.group, coupled, scheme, estimator)
-        self._control = ErrorControl(coupled, scheme, estimator, settings.constants)
+        external = coupled.external
+        self._crossings = crossings(context.system, self._limits, external.jumps)
+        # Where H is a multiple of something a double step cannot end wherever a kink is.
+        kinks = external.kinks if self._limits.quantum is None else ()
+        self._landing_points = LandingPoints(kinks, self._limits.smallest)
+        self._stepper = self._make_stepper(context, estimator)
+        self._control = self._make_control(context, estimator)
         self._defects = InputDefects(coupled, scheme, self._control)
         present, past = EXPONENTS[settings.controller]
         self._controller = StepSizeController(
@@ -110,14 +117,25 @@ class ControlledRun:
         )
         self._orders = None
         if settings.order == "auto":
-            self._orders = OrderSelection(
-                coupled,
-                scheme,
-                control=self._control,
-                estimator=estimator,
-                largest=settings.polynomial,
-                alpha=settings.alpha,
-            )
+            self._orders = self._make_orders(context, estimator)
+
+    def _make_stepper(self, context: RunContext, estimator: ErrorEstimator) -> DoubleStepper:
+        return DoubleStepper(context.group, context.coupled, context.scheme, estimator)
+
+    def _make_control(self, context: RunContext, estimator: ErrorEstimator) -> ErrorControl:
+        constants = context.system.simulation.constants
+        return ErrorControl(context.coupled, context.scheme, estimator, constants)
+
+    def _make_orders(self, context: RunContext, estimator: ErrorEstimator) -> OrderSelection:
+        settings = context.system.simulation
+        return OrderSelection(
+            context.coupled,
+            context.scheme,
+            control=self._control,
+            estimator=estimator,
+            largest=settings.polynomial,
+            alpha=settings.alpha,
+        )
 
     def run(self, y: FloatArray) -> str:
         """Step from outputs ``y`` at T_0, shape (rows, m), to the stop time.
@@ -132,35 +150,32 @@ class ControlledRun:
             self._settings.output_grid, self._scheme.has_derivative, self._start, y
         )
         position = self._first_position(y)
-        for target, event in self._targets():
+        for target, crossing in self._targets():
             while position.time < target:
                 following = self._advance(position, target)
                 if isinstance(following, str):
                     return following
                 position = following
-            if event is not None:
-                following = self._cross(position, event)
+            if crossing is not None:
+                following = self._cross(position, *crossing)
                 if isinstance(following, str):
                     return following
                 position = following
         return ""
 
-    def _targets(self) -> Iterator[tuple[float, DoubleStepTimes | None]]:
-        """Where double steps must end: before each declared event, and at the stop time."""
-        for event in sorted(set(map(float, self._settings.events))):
-            crossing = self._limits.crossing(self._start, event)
-            yield crossing.begin, crossing
+    def _targets(self) -> Iterator[tuple[float, tuple[DoubleStepTimes, str] | None]]:
+        """Where double steps must end: before each known event, and at the stop time."""
+        for crossing in self._crossings:
+            yield crossing[0].begin, crossing
         yield self._settings.end, None
 
     # --- beginnings -----------------------------------------------------------------------------
 
-    def _first_position(self, y: FloatArray) -> _Position:
-        settings, u = self._settings, y[:, self._source]
-        points = settings.polynomial.order + 1  # an input without a derivative needs them all
-        depth = self._estimator.points(points) + self._scheme.known_ahead
-        depth = max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
+    def _first_position(self, y: FloatArray) -> Position:
+        settings, u = self._settings, self._coupled.inputs_of(y)
+        depth = self._depth(settings.polynomial.order + 1)  # inputs without derivatives need all
         history = CouplingHistory.start(self._start, u, depth)
-        position = _Position(history, y, settings.step_size, self._restarted_order())
+        position = Position(history, y, settings.step_size, self._restarted_order())
         if settings.initial_step_size is None:
             position = self._with_initial_step_size(position, self._limits.largest)
         step_size = self._controller.bounded(position.step_size)
@@ -168,12 +183,17 @@ class ControlledRun:
             history = CouplingHistory.at_rest(self._start, u, depth, step_size)
         return replace(position, history=history, step_size=step_size)
 
+    def _depth(self, points: int) -> int:
+        """How many communication points are kept for polynomials through ``points`` points."""
+        depth = self._estimator.points(points) + self._scheme.known_ahead
+        return max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
+
     def _restarted_order(self) -> OrderMemory:
         if self._orders is None:
             return OrderMemory(self._settings.polynomial)
         return self._orders.restart()
 
-    def _with_initial_step_size(self, position: _Position, largest: float) -> _Position:
+    def _with_initial_step_size(self, position: Position, largest: float) -> Position:
         """The position with H from the behaviour of the slaves there, ``largest`` at most [s]."""
         y, stop = position.y, self._settings.end
         scale = 1.0 / self._control.weights(y[0])
@@ -203,16 +223,19 @@ class ControlledRun:
             trial = 0.1 * times.first
         return replace(position, step_size=self._controller.bounded(trial))
 
-    def _polynomials(self, position: _Position) -> Polynomials:
+    def _polynomials(self, position: Position) -> Polynomials:
         points = self._estimator.available(len(position.history.times))
         return self._scheme.extrapolation.polynomials(position.order.polynomial, points)
 
     # --- one attempt ----------------------------------------------------------------------------
 
-    def _advance(self, position: _Position, target: float) -> _Position | str:
+    def _advance(self, position: Position, target: float) -> Position | str:
         """One double step, or the attempt of one, towards ``target`` [s]."""
         wanted = step_within(
             position.bracket, position.time, position.step_size, self._limits.smallest
+        )
+        target = self._landing_points.target(
+            position.time, wanted, target, first=position.controller.rejected
         )
         times = self._limits.times(self._start, position.time, wanted, target)
         polynomials = self._polynomials(position)
@@ -231,17 +254,18 @@ class ControlledRun:
             or does_not_shrink(position.bracket, times.first, defects)
         )
         if jumps and self._is_smallest(times):
-            return self._accept_jump(position, step, error, self._defects.name(defects))
+            name = f"{self._defects.name(defects)} jumps"
+            return self._accept_jump(position, step, error, name)
         if error.norm <= 1.0 and not jumps:
             return self._accept(position, step, error, defects)
         return self._reject(position, step, error, defects)
 
     def _accept(
-        self, position: _Position, step: DoubleStep, error: StepError, defects: Defects | None
-    ) -> _Position:
+        self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
+    ) -> Position:
         self._stepper.accepted()
         times, polynomials = step.times, step.polynomials
-        history = step.history.pushed(times.end, step.end.take(self._source, axis=1))
+        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
         reached: Reached = ((times.middle, step.middle), (times.end, step.end))
         order = max(polynomial.order for polynomial in polynomials)
         self._tell_accepted(step, error, reached, self._results.reached(reached, order))
@@ -263,11 +287,11 @@ class ControlledRun:
         if bracket.end is not None:
             self._statistics.double_steps_at_discontinuities += 1
             if times.end >= bracket.end:  # a false alarm; points so near say nothing of larger H
-                return _Position(
+                return Position(
                     history.cut(), step.end, position.step_size, self._restarted_order()
                 )
         smooth = None if defects is None else (times.first, defects.largest)
-        return _Position(
+        return Position(
             history,
             step.end,
             following,
@@ -278,8 +302,8 @@ class ControlledRun:
         )
 
     def _reject(
-        self, position: _Position, step: DoubleStep, error: StepError, defects: Defects | None
-    ) -> _Position:
+        self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
+    ) -> Position:
         times, bracket = step.times, position.bracket
         is_noticed = error.norm > 1.0 or not error.norm < _INF
         if self._is_smallest(times) and is_noticed:
@@ -291,6 +315,9 @@ class ControlledRun:
         _, following, controller = self._controller.decide(
             times.first, error.norm, self._control.exponent(step.polynomials), position.controller
         )
+        kink = self._landing_points.inside(times)
+        if kink is not None:  # the double step up to there is smooth
+            following = max(following, (kink - times.begin) / 2.0)
         if defects is None:
             return replace(position, step_size=following, controller=controller)
         is_search = bracket.end is not None or not is_noticed
@@ -303,11 +330,11 @@ class ControlledRun:
 
     def _after_failure(
         self,
-        position: _Position,
+        position: Position,
         failed: FailedStep,
         times: DoubleStepTimes,
         polynomials: Polynomials,
-    ) -> _Position | str:
+    ) -> Position | str:
         if failed.status is StepStatus.TERMINATED:
             return f"{failed.slave} ended the simulation after t={times.begin!r} s"
         errors_in_a_row = position.errors_in_a_row + (failed.error is not None)
@@ -346,8 +373,8 @@ class ControlledRun:
 
     # --- discontinuities ------------------------------------------------------------------------
 
-    def _cross(self, position: _Position, times: DoubleStepTimes) -> _Position | str:
-        """The double step over a declared event, whatever its error is."""
+    def _cross(self, position: Position, times: DoubleStepTimes, name: str) -> Position | str:
+        """The double step over a known event, whatever its error is."""
         polynomials = self._polynomials(position)
         step = self._stepper.attempt(position.history, times, polynomials)
         if isinstance(step, FailedStep):
@@ -357,11 +384,11 @@ class ControlledRun:
         error = self._control.judge(step)
         if not error.norm < _INF:
             raise self._stuck(error, times)
-        return self._accept_jump(position, step, error, "event")
+        return self._accept_jump(position, step, error, name)
 
     def _accept_jump(
-        self, position: _Position, step: DoubleStep, error: StepError, name: str
-    ) -> _Position:
+        self, position: Position, step: DoubleStep, error: StepError, name: str
+    ) -> Position:
         """Go on behind a discontinuity: history cut, order and step size as at the start."""
         if not error.norm < _INF:
             raise self._stuck(error, step.times)
@@ -370,10 +397,10 @@ class ControlledRun:
         self._statistics.double_steps_at_discontinuities += 1
         times = step.times
         reached: Reached = ((times.middle, step.middle), (times.end, step.end))
-        error = error._replace(limiting_variable=name if name == "event" else f"{name} jumps")
+        error = error._replace(limiting_variable=name)
         self._tell_accepted(step, error, reached, self._results.jumped(reached))
-        history = step.history.pushed(times.end, step.end.take(self._source, axis=1)).cut()
-        behind = _Position(history, step.end, position.step_size, self._restarted_order())
+        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end)).cut()
+        behind = Position(history, step.end, position.step_size, self._restarted_order())
         if times.end >= self._settings.end:
             return behind
         return self._with_initial_step_size(behind, position.step_size)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from master_node.numerics.dense_output import OutputGrid, OutputHistory
-from master_node.observers import Points, Statistics
+from master_node.observers import Point, Points, Statistics
 from protocol.signals import FloatArray
 
 Reached = tuple[tuple[float, FloatArray], ...]
@@ -46,7 +46,7 @@ class ResultPoints:
         if not times:
             return ()
         values = self._history.at(np.array(times), order, self._has_derivative)
-        return tuple(zip(times, values, strict=True))
+        return tuple(Point(time, y) for time, y in zip(times, values, strict=True))
 
     def jumped(self, reached: Reached) -> Points:
         """The same for points that lead over a discontinuity: nothing smooth lies between them."""
@@ -55,7 +55,7 @@ class ResultPoints:
         if self._grid is None:
             return _values(reached)
         return tuple(
-            (wanted, next(y[0] for point, y in reached if point >= wanted))
+            Point(wanted, next(y[0] for point, y in reached if point >= wanted))
             for wanted in self._wanted(self._grid, time)
         )
 
@@ -66,7 +66,7 @@ class ResultPoints:
 
 
 def _values(reached: Reached) -> Points:
-    return tuple((time, y[0]) for time, y in reached)
+    return tuple(Point(time, y[0]) for time, y in reached)
 
 
 def count_accepted(statistics: Statistics, step_size: float, reached: Reached) -> None:

@@ -323,9 +323,7 @@ def test_adapters_of_all_kinds_work_together(
     start: Start, tmp_path: Path, capability_dir: Path, chassis: str, wheel: str
 ) -> None:
     """Model exchange and intermediate updates under polynomial inputs: the exact solution."""
-    file = system_file(
-        tmp_path, capability_dir / f"{chassis}.fmu", capability_dir / f"{wheel}.fmu"
-    )
+    file = system_file(tmp_path, capability_dir / f"{chassis}.fmu", capability_dir / f"{wheel}.fmu")
     master = start("master_node", "run", file, "--no-plot", "--output", tmp_path / "results")
     assert master.wait() == 0, master.text
     result = assert_summary(tmp_path / "results", "completed")
