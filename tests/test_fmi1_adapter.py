@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -220,6 +221,66 @@ def test_a_negated_alias_has_the_other_sign(
     np.testing.assert_array_equal(plain.get_outputs(1) * [-1.0, 1.0], negated.get_outputs(1))
     description = negated.description
     assert description.variable("minus_x").causality is Causality.OUTPUT
+
+
+@pytest.fixture
+def all_types(capability_dir: Path, tmp_path: Path) -> Path:
+    """The FMU with values of all types in FMI 1.0, one of them a negated alias."""
+    del capability_dir  # whose building finds the package of the examples
+    from capabilities.catalogue import SOURCES, Capabilities, make_fmu  # noqa: PLC0415
+    from capabilities.model_descriptions import Description, Variable  # noqa: PLC0415
+    from fmu_framework import build_fmus  # noqa: PLC0415
+
+    kinds = {
+        "integer": (2, "Int32", "0"),
+        "boolean": (3, "Boolean", "false"),
+        "string": (4, "String", ""),
+    }
+    variables = [
+        Variable(f"{name}_{direction}", reference + offset, causality, type_, start=start)
+        for name, (reference, type_, start) in kinds.items()
+        for direction, causality, offset in (("in", "input", 0), ("out", "output", 100))
+    ]
+    fmu = make_fmu(
+        Description("all_types1", "Inputs and outputs of all types", tuple(variables)),
+        (SOURCES / "all_types2.c",),
+        version=1,
+        capabilities=Capabilities(saved_states=False),
+    )
+    negated = fmu.description.replace(
+        b"<ModelVariables>",
+        b"<ModelVariables>"
+        b'<ScalarVariable name="minus" valueReference="102" alias="negatedAlias" '
+        b'causality="output"><Integer start="0"/></ScalarVariable>'
+        b'<ScalarVariable name="not" valueReference="103" alias="negatedAlias" '
+        b'causality="output"><Boolean start="true"/></ScalarVariable>',
+    )
+    (path,) = build_fmus.build((replace(fmu, description=negated),), tmp_path)
+    return Path(path)
+
+
+def test_all_types_of_fmi_1(load: Load, all_types: Path) -> None:
+    """Integer, Boolean and String make the round trip, negated aliases have the other sign."""
+    names = ("integer_in", "boolean_in", "string_in")
+    outputs = ("integer_out", "not", "string_out", "boolean_out", "minus")
+    slave = load(all_types)
+    slave.initialize(
+        start_time=0.0,
+        stop_time=None,
+        relative_tolerance=None,
+        start_values={"integer_in": 6},
+        inputs=(),
+        outputs=(),
+        discrete_inputs=names,
+        discrete_outputs=outputs,
+    )
+    assert slave.get_discrete_outputs() == (0, True, "", False, 0)  # start values
+    slave.exit_initialization_mode()
+    assert slave.get_discrete_outputs() == (7, False, "got ", True, -7)
+    slave.set_discrete_inputs((41, True, "Füße"))
+    assert slave.get_discrete_outputs() == (42, True, "got Füße", False, -42)
+    with pytest.raises(SlaveError, match="'boolean_in' is of type Boolean; it cannot be 1"):
+        slave.set_discrete_inputs((41, 1, ""))
 
 
 def test_there_is_no_way_back(load: Load) -> None:

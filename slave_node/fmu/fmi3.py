@@ -367,31 +367,31 @@ class Fmi3Slave(FmuSlave):
 
     def get_state(self) -> object:
         """See `Slave`. Beside the FMU's state: times and the inputs' polynomials."""
-        state = self._fmi3.get_state()
+        state = super().get_state()
         times = (self._time, self._inputs_time, self._fmi3.next_event_time, self._rows_set)
         return SavedState(state, np.concatenate([times, self._inputs.rows.ravel()]))
 
     def set_state(self, state: object) -> None:
         """See `Slave`."""
         saved = self._checked(state)
-        self._fmi3.set_state(saved.fmu)
+        super().set_state(saved.fmu)
         self._time, self._inputs_time, self._fmi3.next_event_time, rows = saved.numbers[:4].tolist()
         self._rows_set = int(rows)
         self._inputs.rows[...] = saved.numbers[4:].reshape(self._inputs.rows.shape)
 
     def free_state(self, state: object) -> None:
         """See `Slave`."""
-        self._fmi3.free_state(self._checked(state).fmu)
+        super().free_state(self._checked(state).fmu)
 
     def serialize_state(self, state: object) -> bytes:
         """See `Slave`."""
         saved = self._checked(state)
-        return pack(saved.numbers, self._fmi3.serialize_state(saved.fmu))
+        return pack(saved.numbers, super().serialize_state(saved.fmu))
 
     def deserialize_state(self, data: bytes) -> object:
         """See `Slave`."""
         numbers, fmu = unpack(data, 4 + self._inputs.rows.size)
-        return SavedState(self._fmi3.deserialize_state(fmu), numbers)
+        return SavedState(super().deserialize_state(fmu), numbers)
 
     def _checked(self, state: object) -> SavedState:
         if not isinstance(state, SavedState):

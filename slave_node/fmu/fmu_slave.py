@@ -6,6 +6,7 @@ C types nor loops over variables in Python.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 
 from protocol.errors import SlaveError
@@ -31,6 +32,7 @@ class FmuSlave(Slave):
         self._instance = instance
         self.description: SlaveDescription = instance.model.description
         can = self.description.capabilities
+        self._saves_state = can.can_get_and_set_state
         self._max_rows = MAX_ORDER + 1 if can.can_interpolate_inputs else 1
         self._max_order = min(can.max_output_derivative_order, MAX_ORDER)
         self._rows_set = 1
@@ -94,23 +96,46 @@ class FmuSlave(Slave):
 
     def get_state(self) -> object:
         """See `Slave`."""
-        return self._instance.get_state()
+        self._require_state()
+        instance = self._instance
+        state = ctypes.c_void_p()
+        status = instance.get_fmu_state(ctypes.byref(state))
+        if status:
+            instance.check(instance.state_functions[0], status)
+        return state
 
     def set_state(self, state: object) -> None:
         """See `Slave`."""
-        self._instance.set_state(state)
+        instance = self._instance
+        status = instance.set_fmu_state(state)
+        if status:
+            instance.check(instance.state_functions[1], status)
 
     def free_state(self, state: object) -> None:
         """See `Slave`."""
-        self._instance.free_state(state)
+        instance = self._instance
+        status = instance.free_fmu_state(ctypes.byref(state))  # type: ignore[arg-type]
+        if status:
+            instance.check(instance.state_functions[2], status)
 
     def serialize_state(self, state: object) -> bytes:
         """See `Slave`."""
-        return self._instance.serialize_state(state)
+        self._require_serialization("serialize")
+        return bytes(self._instance.call(self._instance.fmu.serializeFMUState, state))
 
     def deserialize_state(self, data: bytes) -> object:
         """See `Slave`."""
-        return self._instance.deserialize_state(data)
+        self._require_serialization("deserialize")
+        state: object = self._instance.call(self._instance.fmu.deserializeFMUState, data)
+        return state
+
+    def _require_state(self) -> None:
+        if not self._saves_state:
+            raise SlaveError(f"the FMU {self.description.model} cannot save its state")
+
+    def _require_serialization(self, what: str) -> None:
+        if not self.description.capabilities.can_serialize_state:
+            raise SlaveError(f"the FMU {self.description.model} cannot {what} its state")
 
     def terminate(self) -> None:
         """See `Slave`."""

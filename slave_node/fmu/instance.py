@@ -199,12 +199,14 @@ class FmuInstance(ABC):
             ModelError: there is none of a name, or a name comes twice.
         """
         known = self.model.places
-        for i, name in enumerate(names):
+        places: dict[str, Place] = {}
+        for name in names:
             if name not in known:
                 raise ModelError(f"no variable {name!r}{nearest(name, known)}")
-            if name in names[:i]:
+            if name in places:
                 raise ModelError(f"{name!r} is listed twice")
-        return {name: known[name] for name in names}
+            places[name] = known[name]
+        return places
 
     def continuous_places(self, names: Sequence[str]) -> list[Place]:
         """The same for variables that are floating-point numbers.
@@ -281,49 +283,6 @@ class FmuInstance(ABC):
                 name = next(iter(members))
                 error.cause = f"{name!r}: {error.cause}"
                 raise
-
-    # ---- Saved states -------------------------------------------------------------------------
-
-    def require_state(self) -> None:
-        """SlaveError if the FMU cannot save its state."""
-        if not self.model.description.capabilities.can_get_and_set_state:
-            raise SlaveError(f"the FMU {self.model.description.model} cannot save its state")
-
-    def get_state(self) -> ctypes.c_void_p:
-        """Save the state of the FMU."""
-        self.require_state()
-        state = ctypes.c_void_p()
-        status = self.get_fmu_state(ctypes.byref(state))
-        if status:
-            self.check(self.state_functions[0], status)
-        return state
-
-    def set_state(self, state: object) -> None:
-        """Restore the state of the FMU."""
-        status = self.set_fmu_state(state)
-        if status:
-            self.check(self.state_functions[1], status)
-
-    def free_state(self, state: object) -> None:
-        """Free a saved state."""
-        status = self.free_fmu_state(ctypes.byref(state))  # type: ignore[arg-type]
-        if status:
-            self.check(self.state_functions[2], status)
-
-    def serialize_state(self, state: object) -> bytes:
-        """A saved state as bytes."""
-        self._require_serialization("serialize")
-        return bytes(self.call(self.fmu.serializeFMUState, state))
-
-    def deserialize_state(self, data: bytes) -> object:
-        """A saved state from bytes."""
-        self._require_serialization("deserialize")
-        state: object = self.call(self.fmu.deserializeFMUState, data)
-        return state
-
-    def _require_serialization(self, what: str) -> None:
-        if not self.model.description.capabilities.can_serialize_state:
-            raise SlaveError(f"the FMU {self.model.description.model} cannot {what} its state")
 
     # ---- End ----------------------------------------------------------------------------------
 

@@ -276,7 +276,7 @@ class ModelExchangeSlave(FmuSlave):
 
     def get_state(self) -> object:
         """See `Slave`. Beside the FMU's state: times, states, indicators, inputs."""
-        self._model.require_state()
+        self._require_state()
         numbers = np.concatenate(
             [
                 (self._time, self._model_time, self._inputs_time, self._model.next_event_time),
@@ -286,7 +286,7 @@ class ModelExchangeSlave(FmuSlave):
                 self._inputs.rows.ravel(),
             ]
         )
-        return SavedState(self._model.get_state() if self._saves_by_fmu else None, numbers)
+        return SavedState(super().get_state() if self._saves_by_fmu else None, numbers)
 
     def set_state(self, state: object) -> None:
         """See `Slave`."""
@@ -298,7 +298,7 @@ class ModelExchangeSlave(FmuSlave):
         self._rows_set = int(rows_set)
         self._inputs.rows[...] = rows.reshape(self._inputs.rows.shape)
         if self._saves_by_fmu:
-            self._model.set_state(saved.fmu)
+            super().set_state(saved.fmu)
         else:
             self._set_point(self._model_time, np.ascontiguousarray(states).ctypes.data)
 
@@ -306,21 +306,19 @@ class ModelExchangeSlave(FmuSlave):
         """See `Slave`."""
         saved = self._checked(state)
         if self._saves_by_fmu:
-            self._model.free_state(saved.fmu)
+            super().free_state(saved.fmu)
 
     def serialize_state(self, state: object) -> bytes:
         """See `Slave`."""
         saved = self._checked(state)
-        fmu = self._model.serialize_state(saved.fmu) if self._saves_by_fmu else b""
+        fmu = super().serialize_state(saved.fmu) if self._saves_by_fmu else b""
         return pack(saved.numbers, fmu)
 
     def deserialize_state(self, data: bytes) -> object:
         """See `Slave`."""
         count = 6 + self._size + self._indicator_count + self._inputs.rows.size
         numbers, fmu = unpack(data, count)
-        return SavedState(
-            self._model.deserialize_state(fmu) if self._saves_by_fmu else None, numbers
-        )
+        return SavedState(super().deserialize_state(fmu) if self._saves_by_fmu else None, numbers)
 
     def _checked(self, state: object) -> SavedState:
         if not isinstance(state, SavedState):
