@@ -33,12 +33,12 @@ from master_node.numerics.step_size_controller import (
 )
 from master_node.observers import Attempt, Points
 from master_node.order_selection import OrderSelection
-from master_node.result_points import Reached, ResultPoints, count_accepted
+from master_node.outputs import Outputs
+from master_node.result_points import Reached, ReachedPoint, ResultPoints, count_accepted
 from master_node.run_context import RunContext
 from master_node.step_requests import FailedStep
 from master_node.step_size_rules import crossings, step_size_limits
-from protocol.errors import DoublestepError, StepSizeError
-from protocol.signals import FloatArray
+from protocol.errors import DoublestepError, SlaveError, StepSizeError
 from protocol.slave import StepStatus
 
 _INF = float("inf")
@@ -51,23 +51,25 @@ class Position:
 
     Attributes:
         history: inputs up to T_n.
-        y: outputs at T_n, shape (rows, m).
+        outputs: at T_n, those of continuous variables of shape (rows, m).
         step_size: H that is wanted [s].
         controller: the step size controller's memory.
         order: the order control's memory; holds the input polynomial.
         bracket: of a jump that is being looked for.
         smooth: step size and largest defect of the last accepted step.
         errors_in_a_row: attempts that a slave ended with an error.
+        event: where a slave has returned early, and a double step must end [s]; None: nowhere.
     """
 
     history: CouplingHistory
-    y: FloatArray
+    outputs: Outputs
     step_size: float
     order: OrderMemory
     controller: ControllerMemory = NOTHING
     bracket: Bracket = NO_JUMP
     smooth: tuple[float, float] | None = None
     errors_in_a_row: int = 0
+    event: float | None = None
 
     @property
     def time(self) -> float:
@@ -137,8 +139,8 @@ class ControlledRun:
             alpha=settings.alpha,
         )
 
-    def run(self, y: FloatArray) -> str:
-        """Step from outputs ``y`` at T_0, shape (rows, m), to the stop time.
+    def run(self, outputs: Outputs) -> str:
+        """Step from outputs at T_0, those of continuous variables (rows, m), to the stop time.
 
         Returns:
             A slave's wish to end earlier in words, or "".
@@ -147,9 +149,9 @@ class ControlledRun:
             DoublestepError: a slave was lost or failed, or H would have to be too small.
         """
         self._results = ResultPoints(
-            self._settings.output_grid, self._scheme.has_derivative, self._start, y
+            self._settings.output_grid, self._scheme.has_derivative, self._start, outputs
         )
-        position = self._first_position(y)
+        position = self._first_position(outputs)
         for target, crossing in self._targets():
             while position.time < target:
                 following = self._advance(position, target)
@@ -171,11 +173,11 @@ class ControlledRun:
 
     # --- beginnings -----------------------------------------------------------------------------
 
-    def _first_position(self, y: FloatArray) -> Position:
-        settings, u = self._settings, self._coupled.inputs_of(y)
+    def _first_position(self, outputs: Outputs) -> Position:
+        settings, u = self._settings, self._coupled.inputs_of(outputs.y)
         depth = self._depth(settings.polynomial.order + 1)  # inputs without derivatives need all
         history = CouplingHistory.start(self._start, u, depth)
-        position = Position(history, y, settings.step_size, self._restarted_order())
+        position = Position(history, outputs, settings.step_size, self._restarted_order())
         if settings.initial_step_size is None:
             position = self._with_initial_step_size(position, self._limits.largest)
         step_size = self._controller.bounded(position.step_size)
@@ -195,7 +197,7 @@ class ControlledRun:
 
     def _with_initial_step_size(self, position: Position, largest: float) -> Position:
         """The position with H from the behaviour of the slaves there, ``largest`` at most [s]."""
-        y, stop = position.y, self._settings.end
+        y, stop = position.outputs.y, self._settings.end
         scale = 1.0 / self._control.weights(y[0])
         slope = y[1] if len(y) > 1 else None
         trial = trial_step_size(y[0], slope, scale, stop - self._start)
@@ -205,7 +207,7 @@ class ControlledRun:
                 self._start, position.time, max(trial, self._limits.smallest), stop
             )
             polynomials = self._polynomials(position)
-            step = self._stepper.attempt(position.history, times, polynomials)
+            step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
             if isinstance(step, DoubleStep):
                 error = self._control.judge(step)
                 if error.norm < _INF:
@@ -234,28 +236,30 @@ class ControlledRun:
         wanted = step_within(
             position.bracket, position.time, position.step_size, self._limits.smallest
         )
+        if position.event is not None:
+            target = min(target, position.event)
         target = self._landing_points.target(
             position.time, wanted, target, first=position.controller.rejected
         )
         times = self._limits.times(self._start, position.time, wanted, target)
         polynomials = self._polynomials(position)
-        step = self._stepper.attempt(position.history, times, polynomials)
+        step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
         if isinstance(step, FailedStep):
             return self._after_failure(position, step, times, polynomials)
         error = self._control.judge(step)
-        if not self._settings.discontinuities:
-            if error.norm <= 1.0:
-                return self._accept(position, step, error, None)
-            return self._reject(position, step, error, None)
-        defects = self._defects.of(step, position.history, position.y, position.smooth)
-        jumps = (
-            position.bracket.shows_jump(defects)
-            or has_jumped_unnoticed(defects)
-            or does_not_shrink(position.bracket, times.first, defects)
-        )
-        if jumps and self._is_smallest(times):
-            name = f"{self._defects.name(defects)} jumps"
-            return self._accept_jump(position, step, error, name)
+        event = self._event(position, step)
+        defects, jumps = None, False
+        if self._settings.discontinuities:
+            defects = self._defects.of(step, position.history, position.outputs.y, position.smooth)
+            jumps = (
+                position.bracket.shows_jump(defects)
+                or has_jumped_unnoticed(defects)
+                or does_not_shrink(position.bracket, times.first, defects)
+            )
+            if jumps:
+                event = event or f"{self._defects.name(defects)} jumps"
+        if event and self._is_smallest(times):
+            return self._accept_jump(position, step, error, event)
         if error.norm <= 1.0 and not jumps:
             return self._accept(position, step, error, defects)
         return self._reject(position, step, error, defects)
@@ -266,9 +270,13 @@ class ControlledRun:
         self._stepper.accepted()
         times, polynomials = step.times, step.polynomials
         history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
-        reached: Reached = ((times.middle, step.middle), (times.end, step.end))
+        reached = _reached(step)
         order = max(polynomial.order for polynomial in polynomials)
         self._tell_accepted(step, error, reached, self._results.reached(reached, order))
+        if self._event(position, step):
+            self._statistics.discontinuities += 1
+            self._results.cut(reached[-1])
+            return self._behind_event(position, step, history)
         _, following, controller = self._controller.decide(
             times.first, error.norm, self._control.exponent(polynomials), position.controller
         )
@@ -288,12 +296,12 @@ class ControlledRun:
             self._statistics.double_steps_at_discontinuities += 1
             if times.end >= bracket.end:  # a false alarm; points so near say nothing of larger H
                 return Position(
-                    history.cut(), step.end, position.step_size, self._restarted_order()
+                    history.cut(), _end(step), position.step_size, self._restarted_order()
                 )
         smooth = None if defects is None else (times.first, defects.largest)
         return Position(
             history,
-            step.end,
+            _end(step),
             following,
             memory,
             controller,
@@ -337,6 +345,8 @@ class ControlledRun:
     ) -> Position | str:
         if failed.status is StepStatus.TERMINATED:
             return f"{failed.slave} ended the simulation after t={times.begin!r} s"
+        if failed.status is StepStatus.EARLY_RETURN:
+            return self._before_event(position, failed, times, polynomials)
         errors_in_a_row = position.errors_in_a_row + (failed.error is not None)
         if failed.error is not None and errors_in_a_row > 1:
             raise failed.error
@@ -349,6 +359,26 @@ class ControlledRun:
             controller=position.controller._replace(rejected=True),
             errors_in_a_row=errors_in_a_row,
         )
+
+    def _before_event(
+        self,
+        position: Position,
+        failed: FailedStep,
+        times: DoubleStepTimes,
+        polynomials: Polynomials,
+    ) -> Position:
+        """Go back, to end the next double step where a slave has found an event."""
+        self._tell_rejected(times, polynomials, _INF, failed.reason)
+        if not failed.time > times.begin:
+            raise SlaveError(
+                "do_step returned early without getting anywhere",
+                slave=failed.slave,
+                phase="do_step",
+                time=times.begin,
+                step_size=times.first,
+                remedy="the model may have an error in its event handling",
+            )
+        return replace(position, event=failed.time)
 
     def _is_smallest(self, times: DoubleStepTimes) -> bool:
         return times.first <= self._limits.smallest
@@ -376,7 +406,7 @@ class ControlledRun:
     def _cross(self, position: Position, times: DoubleStepTimes, name: str) -> Position | str:
         """The double step over a known event, whatever its error is."""
         polynomials = self._polynomials(position)
-        step = self._stepper.attempt(position.history, times, polynomials)
+        step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
         if isinstance(step, FailedStep):
             following = self._after_failure(position, step, times, polynomials)
             assert isinstance(following, str)  # such a small step is not made smaller
@@ -396,14 +426,29 @@ class ControlledRun:
         self._statistics.discontinuities += 1
         self._statistics.double_steps_at_discontinuities += 1
         times = step.times
-        reached: Reached = ((times.middle, step.middle), (times.end, step.end))
+        reached = _reached(step)
         error = error._replace(limiting_variable=name)
         self._tell_accepted(step, error, reached, self._results.jumped(reached))
-        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end)).cut()
-        behind = Position(history, step.end, position.step_size, self._restarted_order())
-        if times.end >= self._settings.end:
+        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
+        return self._behind_event(position, step, history)
+
+    def _behind_event(
+        self, position: Position, step: DoubleStep, history: CouplingHistory
+    ) -> Position:
+        """Where to go on: the past says nothing any more."""
+        behind = Position(history.cut(), _end(step), position.step_size, self._restarted_order())
+        if step.times.end >= self._settings.end:
             return behind
         return self._with_initial_step_size(behind, position.step_size)
+
+    def _event(self, position: Position, step: DoubleStep) -> str:
+        """What changed at once in a double step, in words; "" if nothing did."""
+        if position.event is not None and step.times.end >= position.event:
+            return "event"
+        d_middle, d_end = step.discrete
+        changed = self._coupled.discrete.changed
+        name = changed(position.outputs.d, d_middle) or changed(d_middle, d_end)
+        return f"{name} changes" if name else ""
 
     # --- what observers and counters are told ---------------------------------------------------
 
@@ -419,6 +464,18 @@ class ControlledRun:
     ) -> None:
         self._statistics.rejected_double_steps += 1
         self._observer.attempted(_attempt(times, polynomials, norm, reason))
+
+
+def _reached(step: DoubleStep) -> Reached:
+    d_middle, d_end = step.discrete
+    return (
+        ReachedPoint(step.times.middle, step.middle, d_middle),
+        ReachedPoint(step.times.end, step.end, d_end),
+    )
+
+
+def _end(step: DoubleStep) -> Outputs:
+    return Outputs(step.end, step.discrete[1])
 
 
 def _attempt(

@@ -24,7 +24,8 @@ from master_node.numerics.order_control import (
     prefer,
 )
 from master_node.observers import Attempt, Points
-from master_node.result_points import Reached, ResultPoints, count_accepted
+from master_node.outputs import Outputs
+from master_node.result_points import Reached, ReachedPoint, ResultPoints, count_accepted
 from master_node.run_context import RunContext
 from master_node.single_step import SingleStepper, remedy_without_rollback, unrepeatable
 from master_node.step_requests import BrokenOffError
@@ -40,13 +41,13 @@ class _Position:
 
     Attributes:
         history: inputs up to T_n.
-        y: outputs at T_n, shape (rows, m).
+        outputs: at T_n, those of continuous variables of shape (rows, m).
         step_size: H that is wanted [s].
         order: the order control's memory; holds the input polynomial.
     """
 
     history: CouplingHistory
-    y: FloatArray
+    outputs: Outputs
     step_size: float
     order: OrderMemory
 
@@ -84,8 +85,8 @@ class DefectRun:
                 derivative_points=min(1, settings.polynomial.derivative_points),
             )
 
-    def run(self, y: FloatArray) -> str:
-        """Step from outputs ``y`` at T_0, shape (rows, m), to the stop time.
+    def run(self, outputs: Outputs) -> str:
+        """Step from outputs at T_0, those of continuous variables (rows, m), to the stop time.
 
         Returns:
             A slave's wish to end earlier in words, or "".
@@ -94,9 +95,9 @@ class DefectRun:
             DoublestepError: a slave was lost, or did not complete a step.
         """
         self._results = ResultPoints(
-            self._settings.output_grid, self._scheme.has_derivative, self._start, y
+            self._settings.output_grid, self._scheme.has_derivative, self._start, outputs
         )
-        position = self._first_position(y)
+        position = self._first_position(outputs)
         try:
             for target, crossing in self._targets():
                 while position.time < target:
@@ -119,7 +120,8 @@ class DefectRun:
 
     # --- beginnings -----------------------------------------------------------------------------
 
-    def _first_position(self, y: FloatArray) -> _Position:
+    def _first_position(self, outputs: Outputs) -> _Position:
+        y = outputs.y
         settings, u = self._settings, self._coupled.inputs_of(y)
         depth = max(settings.polynomial.order + 4 + self._scheme.known_ahead, DEPTH)
         step_size = settings.initial_step_size or self._cautious(y)
@@ -129,7 +131,7 @@ class DefectRun:
             if settings.rests_before_start
             else CouplingHistory.start(self._start, u, depth)
         )
-        return _Position(history, y, step_size, self._restarted_order())
+        return _Position(history, outputs, step_size, self._restarted_order())
 
     def _restarted_order(self) -> OrderMemory:
         polynomial = beginning(self._ladder) if self._ladder else self._settings.polynomial
@@ -155,11 +157,13 @@ class DefectRun:
     def _step(self, position: _Position, end: float, size: float) -> _Position:
         """One step to ``end`` [s], and what comes next."""
         following, polynomials, error = self._take(position, end, size)
-        reached: Reached = ((end, following.y),)
+        reached: Reached = (ReachedPoint(end, *following.outputs),)
         attempt = _attempt(position.time, size, polynomials, error)
-        if error.has_jumped and self._settings.discontinuities:
+        changed = self._coupled.discrete.changed(position.outputs.d, following.outputs.d)
+        if changed or (error.has_jumped and self._settings.discontinuities):
             self._statistics.discontinuities += 1
-            attempt = attempt._replace(limiting_variable=f"{error.limiting_variable} jumps")
+            name = f"{changed} changes" if changed else f"{error.limiting_variable} jumps"
+            attempt = attempt._replace(limiting_variable=name)
             self._tell(attempt, reached, self._results.jumped(reached))
             return self._behind_jump(following)
         self._tell(attempt, reached, self._results.reached(reached, attempt.order))
@@ -169,7 +173,7 @@ class DefectRun:
         """Two steps of the smallest size over a known event, whatever the defects are."""
         for end, size in ((times.middle, times.first), (times.end, times.second)):
             following, polynomials, error = self._take(position, end, size)
-            reached: Reached = ((end, following.y),)
+            reached: Reached = (ReachedPoint(end, *following.outputs),)
             attempt = _attempt(position.time, size, polynomials, error)
             attempt = attempt._replace(limiting_variable=name)
             self._tell(attempt, reached, self._results.jumped(reached))
@@ -190,23 +194,27 @@ class DefectRun:
         polynomials = self._polynomials(position.order.polynomial, history)
         step = DoStep(position.time, size, True)
         try:
-            y = self._stepper.take(history, polynomials, end, step)
+            outputs = self._stepper.take(history, polynomials, end, step, position.outputs)
         except BrokenOffError as broken_off:
             failed = broken_off.failed
             if failed.status is StepStatus.TERMINATED:
                 raise
             remedy = remedy_without_rollback(failed.slave)
             raise unrepeatable(failed, step, remedy) from failed.error
+        y = outputs.y
         u = self._coupled.inputs_of(y)
         error = self._coupling.judge(history, polynomials, ((end, u),), y[0])
-        following = _Position(history.pushed(end, u), y, position.step_size, position.order)
+        following = _Position(history.pushed(end, u), outputs, position.step_size, position.order)
         return following, polynomials, error
 
     def _behind_jump(self, position: _Position) -> _Position:
         """Go on behind a discontinuity: history cut, order and step size as at the start."""
-        step_size = min(self._cautious(position.y), position.step_size)
+        step_size = min(self._cautious(position.outputs.y), position.step_size)
         return _Position(
-            position.history.cut(), position.y, self._bounded(step_size), self._restarted_order()
+            position.history.cut(),
+            position.outputs,
+            self._bounded(step_size),
+            self._restarted_order(),
         )
 
     def _with_next_step_size(self, position: _Position, taken: float) -> _Position:
@@ -236,7 +244,7 @@ class DefectRun:
         history = position.history
         polynomials = self._polynomials(polynomial, history)
         return self._coupling.step_size(
-            history, polynomials, position.y[0], smallest=smallest, largest=largest
+            history, polynomials, position.outputs.y[0], smallest=smallest, largest=largest
         )
 
     def _is_possible(self, polynomial: InputPolynomial, history: CouplingHistory) -> bool:

@@ -7,12 +7,12 @@ from math import ulp
 from master_node.numerics.extrapolation import CouplingHistory
 from master_node.numerics.step_size_controller import fixed_steps
 from master_node.observers import Attempt
-from master_node.result_points import ResultPoints, count_accepted
+from master_node.outputs import Outputs
+from master_node.result_points import ReachedPoint, ResultPoints, count_accepted
 from master_node.run_context import RunContext
 from master_node.single_step import SingleStepper, unrepeatable
 from master_node.step_requests import BrokenOffError
 from protocol.calls import DoStep
-from protocol.signals import FloatArray
 from protocol.slave import StepStatus
 
 _NAN = float("nan")
@@ -25,8 +25,8 @@ class FixedRun:
     def __init__(self, context: RunContext) -> None:
         self._context = context
 
-    def run(self, y: FloatArray) -> str:
-        """Step from outputs ``y`` at T_0, shape (rows, m), to the stop time.
+    def run(self, outputs: Outputs) -> str:
+        """Step from outputs at T_0, those of continuous variables (rows, m), to the stop time.
 
         Communication points are start + n H, so that rounding does not add up.
 
@@ -39,8 +39,8 @@ class FixedRun:
         start, stop, h = float(settings.start_time), settings.end, settings.step_size
         wanted = settings.polynomial
         stepper = SingleStepper(context)
-        results = ResultPoints(settings.output_grid, scheme.has_derivative, start, y)
-        depth, u = wanted.order + 1 + scheme.known_ahead, coupled.inputs_of(y)
+        results = ResultPoints(settings.output_grid, scheme.has_derivative, start, outputs)
+        depth, u = wanted.order + 1 + scheme.known_ahead, coupled.inputs_of(outputs.y)
         history = (
             CouplingHistory.at_rest(start, u, depth, h)
             if settings.rests_before_start
@@ -55,17 +55,18 @@ class FixedRun:
             rest = end - time  # H but for rounding, unless the last step is a shorter one
             step = DoStep(time, h if abs(rest - h) <= rounding else rest, True)
             try:
-                y = stepper.take(history, polynomials, end, step)
+                outputs = stepper.take(history, polynomials, end, step, outputs)
             except BrokenOffError as broken_off:
                 failed = broken_off.failed
                 if failed.status is StepStatus.TERMINATED:
                     return f"{failed.slave} ended the simulation after t={time!r} s"
                 raise unrepeatable(failed, step, _REMEDY) from failed.error
-            history = history.pushed(end, coupled.inputs_of(y))
-            count_accepted(context.statistics, step.step_size, ((end, y),))
+            history = history.pushed(end, coupled.inputs_of(outputs.y))
+            reached = (ReachedPoint(end, *outputs),)
+            count_accepted(context.statistics, step.step_size, reached)
             order = max(polynomial.order for polynomial in polynomials)
             slopes = max(polynomial.derivative_points for polynomial in polynomials)
-            points = results.reached(((end, y),), order)
+            points = results.reached(reached, order)
             context.observer.attempted(
                 Attempt(time, step.step_size, order, slopes, _NAN, True, "", points)
             )

@@ -22,9 +22,9 @@ from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial,
 from master_node.numerics.initial_step_size import untried_step_size
 from master_node.numerics.order_control import LARGEST_FACTOR, SMALLEST_FACTOR, Candidate
 from master_node.order_selection import OrderSelection
+from master_node.outputs import Outputs
 from master_node.run_context import RunContext
 from master_node.step_requests import BrokenOffError
-from protocol.signals import FloatArray
 
 if TYPE_CHECKING:
     from master_node.configuration import SimulationSettings
@@ -50,10 +50,10 @@ class MixedRun(ControlledRun):
         self._coupling = CouplingDefects(coupled, scheme, shape)
         super().__init__(context, estimator)
 
-    def run(self, y: FloatArray) -> str:
+    def run(self, outputs: Outputs) -> str:
         """See `ControlledRun`."""
         try:
-            return super().run(y)
+            return super().run(outputs)
         except BrokenOffError as broken_off:  # a late slave's wish
             time = self._statistics.time
             return f"{broken_off.failed.slave} ended the simulation after t={time!r} s"
@@ -79,7 +79,7 @@ class MixedRun(ControlledRun):
 
     def _with_initial_step_size(self, position: Position, largest: float) -> Position:
         """The position with an H so small that the first step need not be taken back."""
-        y, settings = position.y, self._settings
+        y, settings = position.outputs.y, self._settings
         untried = untried_step_size(
             y[0],
             y[1] if len(y) > 1 and self._scheme.has_derivative.all() else None,
@@ -91,7 +91,7 @@ class MixedRun(ControlledRun):
     def _accept(
         self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
     ) -> Position:
-        step = self._late_slaves.follow(position.history, step)
+        step = self._late_slaves.follow(position.history, position.outputs, step)
         u_middle, u_end = map(self._coupled.inputs_of, (step.middle, step.end))
         coupling = self._coupling.judge(
             position.history,
@@ -113,7 +113,7 @@ class MixedRun(ControlledRun):
         bound = self._coupling.step_size(
             following.history,
             self._polynomials(following),
-            following.y[0],
+            following.outputs.y[0],
             smallest=min(SMALLEST_FACTOR * taken, following.step_size),
             largest=following.step_size,
         )
@@ -123,7 +123,7 @@ class MixedRun(ControlledRun):
         self, position: Position, step: DoubleStep, error: StepError, name: str
     ) -> Position:
         if error.norm < _INF:
-            step = self._late_slaves.follow(position.history, step)
+            step = self._late_slaves.follow(position.history, position.outputs, step)
         return super()._accept_jump(position, step, error, name)
 
 

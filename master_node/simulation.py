@@ -94,7 +94,9 @@ def run(
         for warning in check_capabilities(coupled, system):
             log.warning("%s", warning)
         wanted = system.results
-        check_variables(wanted.variables, coupled.output_names, system.source)
+        check_variables(
+            wanted.variables, (*coupled.output_names, *coupled.discrete.names), system.source
+        )
         keepers: list[Observer] = [] if recording is None else [recording]
         if directory is not None:
             keepers.append(ResultsWriter(directory, settings_of(system, slaves.descriptions)))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 
+from master_node.discrete_step_requests import step_requests
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials
+from master_node.outputs import Outputs
 from master_node.run_context import RunContext
-from master_node.step_requests import FailedStep, Piece, StepRequests
+from master_node.step_requests import FailedStep, Piece
 from protocol.calls import DoStep
 from protocol.errors import DoublestepError, SlaveError
 from protocol.signals import FloatArray
@@ -23,11 +25,16 @@ class SingleStepper:
     def __init__(self, context: RunContext) -> None:
         self._scheme = context.scheme
         self._coupled = context.coupled
-        self._requests = StepRequests(context.group, context.coupled, context.scheme)
+        self._requests = step_requests(context.group, context.coupled, context.scheme)
 
     def take(
-        self, history: CouplingHistory, polynomials: Polynomials, end: float, step: DoStep
-    ) -> FloatArray:
+        self,
+        history: CouplingHistory,
+        polynomials: Polynomials,
+        end: float,
+        step: DoStep,
+        begin: Outputs,
+    ) -> Outputs:
         """One step from the newest point of ``history``.
 
         Args:
@@ -35,9 +42,10 @@ class SingleStepper:
             polynomials: of the inputs, for each kind.
             end: of the step [s].
             step: the call.
+            begin: outputs at the beginning of the step.
 
         Returns:
-            Outputs at its end, shape (rows, m).
+            Outputs at its end, those of continuous variables of shape (rows, m).
 
         Raises:
             BrokenOffError: a slave did not get to the end, or an output there is not finite.
@@ -46,9 +54,10 @@ class SingleStepper:
         scheme = self._scheme
         inputs = partial(self._inputs, history, polynomials, end)
         external = self._coupled.external.over(step.communication_point, end)
-        piece = Piece((), inputs, external, step, scheme.get_outputs, scheme.output_rows)
-        (y,) = self._requests.take([piece])
-        return y
+        held = self._coupled.discrete.held(begin.y[0], begin.d)
+        piece = Piece((), inputs, external, held, step, scheme.get_outputs, scheme.output_rows)
+        (outputs,) = self._requests.take([piece])
+        return outputs
 
     def _inputs(
         self, history: CouplingHistory, polynomials: Polynomials, end: float, known: FloatArray

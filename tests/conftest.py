@@ -64,18 +64,18 @@ def oscillator_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def quarter_car_ssp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package of the example, with a nested system."""
+    (package,) = _example("ssp", "build").build(tmp_path_factory.mktemp("ssp"))
+    return Path(package)
+
+
+@pytest.fixture(scope="session")
 def capability_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with the FMUs of all capabilities."""
     folder = tmp_path_factory.mktemp("capabilities")
     _example("capabilities", "build").build(folder)
     return folder
-
-
-@pytest.fixture(scope="session")
-def quarter_car_ssp(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The package of the example, with a nested system."""
-    (package,) = _example("ssp", "build").build(tmp_path_factory.mktemp("ssp"))
-    return Path(package)
 
 
 @pytest.fixture(scope="session")
