@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from protocol.calls import Configure
 from protocol.errors import ModelError, SlaveError
@@ -16,6 +18,7 @@ from protocol.signals import InputSignal
 from protocol.slave import Causality, InputDerivatives, Slave, StartValue, StepStatus, VariableType
 from slave_node.fmu.description import describe_fmu
 from slave_node.fmu.loading import load_fmu
+from slave_node.inspection import description_tables
 from slave_node.loading import load_slave
 
 Load = Callable[..., Slave]
@@ -476,6 +479,17 @@ def test_clocks_are_reported(load: Load, caplog: pytest.LogCaptureFixture) -> No
     name = remark.split()[1]
     with pytest.raises(SlaveError, match="is of type Clock, which is not exchanged"):
         initialized(slave, discrete_outputs=(name,))
+
+
+def test_inspection_shows_what_is_not_carried(capability_dir: Path) -> None:
+    """Remarks and the only step size stand among what ``slave-node inspect`` shows."""
+    for model, words in (
+        ("all_types3", "clock clock (triggered) is ignored"),
+        ("fixed_step_fmi3", "0.01"),
+    ):
+        console = Console(file=StringIO(), width=300)
+        console.print(*description_tables(describe_fmu(capability_dir / f"{model}.fmu")))
+        assert words in console.file.getvalue()  # type: ignore[attr-defined]
 
 
 # ---- Events ------------------------------------------------------------------------------------
