@@ -153,6 +153,11 @@ class Variable:
         """True for what takes part in extrapolation and in the error norm."""
         return self.type.is_real and self.variability == "continuous"
 
+    @property
+    def is_discrete(self) -> bool:
+        """True for what is held between communication points; clocks carry no value."""
+        return not self.is_continuous_real and self.type is not VariableType.CLOCK
+
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
