@@ -334,6 +334,7 @@ class BusSettings(_Table):
         insecure: allow addresses other than loopback.
         discovery_timeout: how long to wait for slaves to appear [s].
         step_timeout: how long one request may take [s].
+        reconnect_time: how long to wait in mid run for a slave whose connection was lost [s].
         pin: keep the node and the worker of each launched slave on one processor, so that a
             request is handed over without waking another one. For small models; a model with
             threads of its own would have only that processor.
@@ -344,6 +345,7 @@ class BusSettings(_Table):
     insecure: StrictBool = False
     discovery_timeout: Positive = 30.0
     step_timeout: Positive = 60.0
+    reconnect_time: Annotated[Number, Field(gt=0, le=3000)] = 10.0
     pin: StrictBool = False
 
 
