@@ -24,6 +24,10 @@ app = typer.Typer(
 
 log = logging.getLogger("master_node")
 
+Tls = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Certificates: encrypt, and let in only who has one."),
+]
 ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
 
 
@@ -77,6 +81,10 @@ def run(  # noqa: PLR0917  options of the command line
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
     ] = False,
+    tls: Tls = None,
+    mode: Annotated[
+        str | None, typer.Option(help="peer: reach slaves directly; client: through a router.")
+    ] = None,
     timeout: Annotated[
         float | None, typer.Option(help="How long to wait for slaves to appear [s].")
     ] = None,
@@ -116,6 +124,8 @@ def run(  # noqa: PLR0917  options of the command line
                 connect=tuple(connect or ()),
                 listen=tuple(listen or ()),
                 insecure=insecure,
+                tls=None if tls is None else str(tls.absolute()),
+                mode=mode,
                 discovery_timeout=timeout,
                 pin=pin,
             )

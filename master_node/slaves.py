@@ -13,6 +13,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from secrets import token_hex
 
+from master_node.announcement import announce_run
 from master_node.configuration import System
 from master_node.launcher import Launcher
 from master_node.presence import Presence
@@ -20,6 +21,8 @@ from master_node.remote_slave import RemoteSlave
 from master_node.slave_link import LocalSlave, SlaveLink
 from protocol.bus import DEFAULT_ENDPOINT
 from protocol.calls import Describe
+from protocol.credentials import Credentials, Role
+from protocol.endpoints import Endpoints, Mode, free_endpoint
 from protocol.errors import (
     ConfigurationError,
     DeadlineError,
@@ -27,9 +30,8 @@ from protocol.errors import (
     InterruptedRunError,
     SlaveLostError,
 )
-from protocol.keys import alive_master
 from protocol.slave import SlaveDescription
-from protocol.zenoh_bus import Endpoints, ZenohBus, free_endpoint
+from protocol.zenoh_bus import ZenohBus
 
 _DEATH_TIME = 1.0
 
@@ -105,11 +107,14 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
     found = [name for name in system.slaves if name not in launched]
     private = free_endpoint()
     with ExitStack() as stack:
-        bus = ZenohBus(_endpoints(system, private, launched=bool(launched), found=bool(found)))
+        endpoints = _endpoints(system, private, launched=bool(launched), found=bool(found))
+        bus = ZenohBus(endpoints, timeout=system.bus.discovery_timeout)
         stack.callback(bus.close)
         run = token_hex(4)
-        bus.announce(alive_master(run))
-        launcher = stack.enter_context(Launcher(private, log_directory, pin=system.bus.pin))
+        announce_run(bus, run, system)
+        launcher = stack.enter_context(
+            Launcher(_connection(endpoints, private), log_directory, pin=system.bus.pin)
+        )
         keys = {
             name: launcher.launch(name, str(system.slaves[name].model), system.base)
             for name in system.slaves
@@ -160,14 +165,39 @@ def _describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
 
 
 def _endpoints(system: System, private: str, *, launched: bool, found: bool) -> Endpoints:
-    listen = list(system.bus.listen)
-    if found and not listen and not system.bus.connect:
-        listen.append(DEFAULT_ENDPOINT)
-    if launched:
-        listen.append(private)
+    bus = system.bus
+    mode = Mode(bus.mode)
+    listen, connect = list(bus.listen), list(bus.connect)
+    if mode is Mode.CLIENT:
+        connect = connect or [DEFAULT_ENDPOINT]
+    else:
+        if found and not listen and not connect:
+            listen.append(DEFAULT_ENDPOINT)
+        if launched:
+            listen.append(private)
     try:
-        return Endpoints(tuple(listen), tuple(system.bus.connect), system.bus.insecure)
+        credentials = (
+            None
+            if system.certificates is None
+            else Credentials(system.certificates.absolute(), Role.MASTER)
+        )
+        return Endpoints(tuple(listen), tuple(connect), bus.insecure, mode, credentials)
     except ConfigurationError as error:
         raise ConfigurationError(
             f"{system.source}: [bus] {error.cause}", remedy=error.remedy
         ) from None
+
+
+def _connection(endpoints: Endpoints, private: str) -> list[str]:
+    """The options by which a slave that is started here comes to the same bus."""
+    words = []
+    if endpoints.mode is Mode.CLIENT:
+        words = ["--mode", "client"]
+        words += [word for endpoint in endpoints.connect for word in ("--connect", endpoint)]
+    else:
+        words = ["--connect", private]
+    if endpoints.insecure:
+        words.append("--insecure")
+    if endpoints.credentials is not None:
+        words += ["--tls", str(endpoints.credentials.directory)]
+    return words

@@ -22,6 +22,7 @@ class Holder:
         host, pid: its process.
         since: wall-clock time of its claim, for people.
         orphan_time: how long it is waited for when it vanished [s].
+        claimed: time of its claim in seconds since 1970.
     """
 
     run: str
@@ -29,6 +30,7 @@ class Holder:
     pid: int
     since: str
     orphan_time: float = DEFAULT_ORPHAN_TIME
+    claimed: float = 0.0
 
     def __str__(self) -> str:
         return f"run {self.run} on {self.host} (pid {self.pid}) since {self.since}"

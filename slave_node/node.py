@@ -10,10 +10,11 @@ import logging
 import os
 import socket
 import threading
+import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
 
-from protocol.administration import DEFAULT_ORPHAN_TIME, Claim
+from protocol.administration import DEFAULT_ORPHAN_TIME, Claim, SlaveStatus
 from protocol.bus import Bus
 from protocol.calls import CALLS, Call, Reply, Reset
 from protocol.codec import (
@@ -86,7 +87,7 @@ class SlaveNode:
         self._changes_of_master = 0
         self._running = threading.Lock()
         self._worker_alive = True
-        self._since = _now()
+        self._since = time.time()
 
     def serve(self) -> None:
         """Serve until the bus is closed; the token goes up last: alive means serving.
@@ -196,7 +197,7 @@ class SlaveNode:
 
     def _holder(self, claim: Claim) -> Holder:
         orphan_time = self._orphan_time if claim.orphan_time is None else claim.orphan_time
-        return Holder(claim.run, claim.host, claim.pid, _now(), orphan_time)
+        return Holder(claim.run, claim.host, claim.pid, _now(), orphan_time, time.time())
 
     def _release(self, data: bytes) -> bytes:
         try:
@@ -230,23 +231,26 @@ class SlaveNode:
 
     def _status(self, _: bytes) -> bytes:
         holder = self._claims.holder
-        return encode_map(
-            {
-                "name": self._key.name,
-                "instance": self._key.instance,
-                "host": socket.gethostname(),
-                "pid": os.getpid(),
-                "model": self._description.model,
-                "kind": self._description.kind,
-                "sha256": self._description.sha256,
-                "state": "free" if holder is None else "held",
-                "busy": self.busy,
-                "worker": "alive" if self._worker_alive else "dead",
-                "holder": None if holder is None else str(holder),
-                "since": self._since,
-                "protocol_version": PROTOCOL_VERSION,
-            }
+        status = SlaveStatus(
+            name=self._key.name,
+            instance=self._key.instance,
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            model=self._description.model,
+            kind=self._description.kind,
+            sha256=self._description.sha256,
+            capabilities=_capabilities(self._description),
+            state="free" if holder is None else "held",
+            busy=self.busy,
+            worker="alive" if self._worker_alive else "dead",
+            holder=None if holder is None else str(holder),
+            run=None if holder is None else holder.run,
+            held_since=None if holder is None else holder.claimed,
+            since=self._since,
+            time=time.time(),
+            protocol_version=PROTOCOL_VERSION,
         )
+        return encode_map(status.to_message())
 
     def _master_changed(self, key: str, alive: bool) -> None:
         holder = self._claims.holder
@@ -283,6 +287,18 @@ class SlaveNode:
                 self._reset()
         except (SequenceError, SlaveLostError) as error:
             log.info("not reset: %s", error)  # released meanwhile, or the node is ending
+
+
+def _capabilities(description: SlaveDescription) -> str:
+    """In short what a master asks of a slave."""
+    can = description.capabilities
+    known = {
+        f"saves state ({description.state_kind})": can.can_get_and_set_state,
+        "variable steps": can.can_handle_variable_step_size,
+        "input derivatives": can.can_interpolate_inputs,
+        "output derivatives": can.max_output_derivative_order > 0,
+    }
+    return ", ".join(name for name, has in known.items() if has)
 
 
 def _epoch(message: Mapping[str, StartValue]) -> int:

@@ -11,8 +11,9 @@ from queue import Empty, SimpleQueue
 import pytest
 
 from protocol.bus import Bus, InProcessBus
+from protocol.endpoints import Endpoints, host_of
 from protocol.errors import ConfigurationError, DeadlineError, DoublestepError, SlaveLostError
-from protocol.zenoh_bus import Endpoints, ZenohBus, host_of
+from protocol.zenoh_bus import ZenohBus
 
 BOUND = 10.0
 """No wait in these tests is longer [s]."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,8 @@ import pytest
 
 from master_node import load_system, simulate
 from tests.network_namespaces import Hosts, hosts_on_a_bridge, unavailable
-from tests.test_processes import MODELS, Command, system_file, wait_until
+from tests.quarter_car_case import EXAMPLES
+from tests.test_processes import MODELS, Command, system_file, toml, wait_until
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="uses signals"),
@@ -64,13 +66,18 @@ def hosts() -> Iterator[Hosts]:
         yield made
 
 
+def nap(folder: Path) -> dict[str, object]:
+    """The parameters of a chassis that naps once in mid run."""
+    return {"sleeps_at": 0.05, "nap": NAP, "bed": str(folder / "asleep")}
+
+
 def chassis_words(folder: Path) -> list[object]:
-    """What to serve: a chassis that naps once in mid run."""
-    values = {"sleeps_at": 0.05, "nap": NAP, "bed": f'"{folder / "asleep"}"'}
+    """How to serve it."""
+    parameters = [f"{name}={toml(value)}" for name, value in nap(folder).items()]
     return [
         f"{MODELS}:Napper",
         *("--name", "chassis"),
-        *(word for name, value in values.items() for word in ("--parameter", f"{name}={value}")),
+        *(word for parameter in parameters for word in ("--parameter", parameter)),
     ]
 
 
@@ -139,3 +146,87 @@ def test_a_cable_that_stays_cut_ends_the_run(start: Commands, hosts: Hosts, tmp_
         last,
     ), last
     assert len((tmp_path / "out" / "results.csv").read_text().splitlines()) > 10
+
+
+# ---- Routers ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chassis", ["by hand", "launched"])
+def test_a_router_between_all_and_its_restart(
+    chassis: str, start: Commands, tmp_path: Path, endpoint: str
+) -> None:
+    """Two slaves and a master as clients; the router is killed in mid step and started again.
+
+    The slaves are there before the router is. The bits are those of a run in process.
+    """
+    through = ("--connect", endpoint, "--mode", "client")
+    wheel = start(
+        *("slave_node", "serve", EXAMPLES / "quarter_car.py:Wheel", "--name", "wheel"), *through
+    )
+    if chassis == "by hand":
+        start("slave_node", "serve", *chassis_words(tmp_path), *through)
+    router = start("slave_node", "router", "--listen", endpoint)
+    wheel.wait_for("ready")
+    launched = chassis == "launched"
+    file = system_file(
+        tmp_path,
+        f"{MODELS}:Napper" if launched else None,
+        None,
+        simulation=SIMULATION,
+        bus=f'mode = "client"\nconnect = ["{endpoint}"]\n',
+        chassis_parameters=nap(tmp_path) if launched else None,
+    )
+    master = start("master_node", "run", file, "--output", tmp_path / "out")
+    wait_until((tmp_path / "asleep").exists)
+    router.send(signal.SIGKILL)
+    router.wait()
+    second = start("slave_node", "router", "--listen", endpoint)
+    assert master.wait() == 0, master.text
+    assert (tmp_path / "out" / "results.csv").read_bytes() == reference(tmp_path)
+    assert "WARNING: the connection to chassis, wheel was lost" in master.text
+    second.send(signal.SIGTERM)
+    assert second.wait() == 0
+    assert "ending: SIGTERM" in second.text
+
+
+def test_a_cut_behind_a_router(start: Commands, hosts: Hosts, tmp_path: Path) -> None:
+    """Master, router and slave on three hosts; the slave's cable is cut for 2 s in mid step."""
+    where = f"tcp/{hosts.addresses['router']}:7447"
+    through = ("--connect", where, "--mode", "client", "--insecure")
+    start("slave_node", "router", "--listen", where, "--insecure", on=hosts.prefix("router"))
+    slave = start(
+        *("slave_node", "serve", *chassis_words(tmp_path), *through), on=hosts.prefix("slave")
+    )
+    file = system_file(tmp_path, None, simulation=SIMULATION)
+    master = start(
+        *("master_node", "run", file, "--output", tmp_path / "out", *through),
+        on=hosts.prefix("master"),
+    )
+    wait_until((tmp_path / "asleep").exists)
+    hosts.cut("slave")
+    time.sleep(2.0)
+    hosts.heal("slave")
+    assert master.wait() == 0, master.text
+    assert (tmp_path / "out" / "results.csv").read_bytes() == reference(tmp_path)
+    assert master.text.count("WARNING") <= 1
+    slave.wait_for("released by")
+
+
+def test_no_router(start: Commands, tmp_path: Path, endpoint: str) -> None:
+    """A master says so after its time; a slave waits, and ends on a signal all the same."""
+    through = ("--connect", endpoint, "--mode", "client")
+    slave = start("slave_node", "serve", *chassis_words(tmp_path), *through)
+    file = system_file(tmp_path, None, simulation=SIMULATION)
+    master = start(
+        *("master_node", "run", file, "--output", tmp_path / "out", "--timeout", "1"), *through
+    )
+    assert master.wait() == 3
+    assert f"connect: no router at {endpoint} within 1 s; start it with" in master.text
+    slave.send(signal.SIGTERM)
+    assert slave.wait() == 0, slave.text
+    wrong = start(
+        *("slave_node", "serve", *chassis_words(tmp_path)),
+        *("--mode", "client", "--listen", endpoint),
+    )
+    assert wrong.wait() == 2
+    assert "a client connects to a router and does not listen" in wrong.text

@@ -38,6 +38,7 @@ from protocol.codec import (
     encode_program,
     encode_request,
 )
+from protocol.endpoints import Endpoints
 from protocol.errors import (
     ConfigurationError,
     DoublestepError,
@@ -60,7 +61,7 @@ from protocol.keys import (
     alive_slaves,
 )
 from protocol.slave import SlaveDescription
-from protocol.zenoh_bus import Endpoints, ZenohBus
+from protocol.zenoh_bus import ZenohBus
 from slave_node.node import SlaveNode
 from slave_node.worker import ModelReference, WorkerProcess
 
