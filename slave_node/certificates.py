@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from secrets import token_hex
 from typing import Self
 
 from cryptography import x509
@@ -56,6 +57,8 @@ class Host:
             raise ConfigurationError(
                 f"--host {text}: an address is empty", remedy="write NAME or NAME=ADDRESS,ADDRESS"
             )
+        for address in (name, *addresses):
+            _general_name(address)
         return cls(name, (name, *addresses))
 
 
@@ -130,7 +133,8 @@ class _Authority:
     @classmethod
     def _make(cls) -> Self:
         key = ec.generate_private_key(ec.SECP256R1())
-        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Doublestep authority")])
+        text = f"Doublestep authority {token_hex(4)}"  # two of one name confuse TLS
+        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
         builder = _builder(name, name, key.public_key(), _AUTHORITY_DAYS)
         builder = builder.add_extension(
             x509.BasicConstraints(ca=True, path_length=0), critical=True

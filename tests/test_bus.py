@@ -411,6 +411,12 @@ def test_loopback_is_allowed(endpoint: str, host: str) -> None:
     assert host_of(endpoint) == host
 
 
+def test_tls_needs_certificates() -> None:
+    """An address alone does not make a connection secure."""
+    with pytest.raises(ConfigurationError, match="needs certificates; name their .* with --tls"):
+        Endpoints(connect=("tls/127.0.0.1:7447",), insecure=True)
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -424,7 +430,7 @@ def test_loopback_is_allowed(endpoint: str, host: str) -> None:
         "tcp/127.0.0.1:-1",
         "tcp/127.0.0.1:65536",
         "udp/127.0.0.1:7447",
-        "tls/127.0.0.1:7447",
+        "tls/127.0.0.1",
         "tcp/127.0.0.1:7447#iface=eth0",
         "tcp/127.0.0.1:7447?prio=1",
         "tcp//127.0.0.1:7447 ",
