@@ -280,6 +280,7 @@ def doctor(
     from rich.console import Console  # noqa: PLC0415
 
     from master_node.doctor import diagnose  # noqa: PLC0415
+    from master_node.plain_text import plain  # noqa: PLC0415
     from master_node.windows import windows  # noqa: PLC0415
 
     with (
@@ -292,7 +293,7 @@ def doctor(
     for table in diagnosis.tables():
         Console().print(table)
     for problem in diagnosis.problems:
-        typer.echo(f"{problem.where}: {problem.cause}; {problem.remedy}")
+        typer.echo(plain(f"{problem.where}: {problem.cause}; {problem.remedy}"))
     if diagnosis.problems:
         raise typer.Exit(1)
     typer.echo("no problem found")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from rich.table import Table
 
+from master_node.plain_text import plain
 from master_node.survey import Participant, Timing, measure, survey
 from master_node.windows import Window
 from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
@@ -53,19 +54,19 @@ class Diagnosis:
         for window in self.windows:
             result = "listening" if window.listens else "connected"
             failure = window.failure
-            ways.add_row(window.endpoint, result if failure is None else failure.cause)
+            ways.add_row(window.endpoint, plain(result if failure is None else failure.cause))
         there = Table(title="Participants", title_justify="left")
         for column in ("name", "host / pid", "answers", "round trip", "clock", "state"):
             there.add_column(column, no_wrap=True)
         for participant, timing in self.timings:
             status = participant.status
             there.add_row(
-                described(participant),
-                "-" if status is None else f"{status.host} / {status.pid}",
+                plain(described(participant)),
+                plain("-" if status is None else f"{status.host} / {status.pid}"),
                 f"{len(timing.round_trips)} of {_ROUNDS}",
                 _milliseconds(timing.median),
                 _milliseconds(timing.clock_difference, signed=True),
-                _state(participant),
+                plain(_state(participant)),
             )
         return [ways, there]
 
@@ -125,7 +126,7 @@ def _problems_of(participant: Participant, timing: Timing) -> list[Problem]:
         problems.append(
             Problem(where, f"{lost} of {_ROUNDS} queries were not answered", "look at the network")
         )
-    if abs(timing.clock_difference) > _CLOCK_DIFFERENCE:
+    if timing.round_trips and not abs(timing.clock_difference) <= _CLOCK_DIFFERENCE:
         problems.append(
             Problem(
                 where,

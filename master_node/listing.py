@@ -8,6 +8,7 @@ from datetime import datetime
 
 from rich.table import Table
 
+from master_node.plain_text import plain
 from master_node.survey import Participant
 from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
 from protocol.keys import MasterKey, SlaveKey
@@ -17,22 +18,21 @@ def listing_tables(participants: Sequence[Participant]) -> list[Table]:
     """Slaves, co-simulations and routers; no table for what there is none of."""
     slaves = _table("Slaves", "name", "host", "model", "kind", "capabilities", "state", "since")
     runs = _table("Co-simulations", "run", "host", "system", "slaves", "since")
-    routers = _table("Routers", "host", "pid", "addresses", "since")
+    routers = _table("Routers", "host", "addresses", "since")
     silent = _table("No answer", "key", "cause")
     for participant in participants:
         match participant.status:
             case SlaveStatus() as s:
-                state = (
-                    s.state if s.holder is None else f"held by {s.holder.partition(' since')[0]}"
-                )
+                held = "" if s.holder is None else f" by {s.holder.partition(' since')[0]}"
                 since = _clock(s.since if s.held_since is None else s.held_since)
-                slaves.add_row(s.name, s.host, s.model, s.kind, s.capabilities, state, since)
+                row = (s.name, s.host, s.model, s.kind, s.capabilities, s.state + held, since)
+                _add(slaves, *row)
             case MasterStatus() as m:
-                runs.add_row(m.run, f"{m.host} / {m.pid}", m.system, m.slaves, _clock(m.since))
+                _add(runs, m.run, f"{m.host} / {m.pid}", m.system, m.slaves, _clock(m.since))
             case RouterStatus() as r:
-                routers.add_row(r.host, str(r.pid), r.endpoints, _clock(r.since))
+                _add(routers, f"{r.host} / {r.pid}", r.endpoints, _clock(r.since))
             case None:
-                silent.add_row(participant.key.alive, str(participant.failure))
+                _add(silent, participant.key.alive, participant.failure)
     return [table for table in (slaves, runs, routers, silent) if table.row_count]
 
 
@@ -55,6 +55,10 @@ def listing_data(participants: Sequence[Participant]) -> dict[str, list[dict[str
 
 def _table(title: str, *columns: str) -> Table:
     return Table(*columns, title=title, title_justify="left")
+
+
+def _add(table: Table, *cells: object) -> None:
+    table.add_row(*map(plain, cells))
 
 
 def _clock(seconds: float) -> str:

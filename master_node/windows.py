@@ -54,7 +54,8 @@ def windows(
         connect: addresses of routers, and of masters and slaves that listen.
         listen: addresses to which slaves connect while no master runs. Without any address the
             default one is used, whichever way works.
-        insecure, credentials: as in `Endpoints`.
+        insecure: allow other addresses than loopback without TLS.
+        credentials: for TLS.
 
     Raises:
         ConfigurationError: an address is not valid, or cannot be listened on.

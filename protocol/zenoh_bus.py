@@ -121,9 +121,9 @@ def _open_client(
                 attempt.check()
         if end is not None and time.monotonic() > end:
             raise SlaveLostError(
-                f"no router at {where} within {timeout:g} s",
+                f"no connection to {where} within {timeout:g} s",
                 phase="connect",
-                remedy="start it with `slave-node router --listen ...`, or check --connect",
+                remedy="start the router with `slave-node router --listen ...`, or check --connect",
             )
         stop.wait(max(0.0, begin + _CLIENT_ATTEMPT_MS / 1000 - time.monotonic()))
     raise SlaveLostError(f"ended while waiting for a router at {where}")

@@ -413,7 +413,7 @@ def test_loopback_is_allowed(endpoint: str, host: str) -> None:
 
 def test_tls_needs_certificates() -> None:
     """An address alone does not make a connection secure."""
-    with pytest.raises(ConfigurationError, match="needs certificates; name their .* with --tls"):
+    with pytest.raises(ConfigurationError, match=r"needs certificates; name their .* with --tls"):
         Endpoints(connect=("tls/127.0.0.1:7447",), insecure=True)
 
 

@@ -221,7 +221,7 @@ def test_no_router(start: Commands, tmp_path: Path, endpoint: str) -> None:
         *("master_node", "run", file, "--output", tmp_path / "out", "--timeout", "1"), *through
     )
     assert master.wait() == 3
-    assert f"connect: no router at {endpoint} within 1 s; start it with" in master.text
+    assert f"connect: no connection to {endpoint} within 1 s; start the router" in master.text
     slave.send(signal.SIGTERM)
     assert slave.wait() == 0, slave.text
     wrong = start(
