@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import time
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ pytestmark = [
     pytest.mark.usefixtures("no_process_left"),
 ]
 
+ROOT = Path(__file__).parents[1]
 BOUND = 30.0
 """No wait in these tests is longer [s]."""
 
@@ -230,3 +232,38 @@ def test_no_router(start: Commands, tmp_path: Path, endpoint: str) -> None:
     )
     assert wrong.wait() == 2
     assert "a client connects to a router and does not listen" in wrong.text
+
+
+# ---- The document -------------------------------------------------------------------------------
+
+
+def test_the_deployment_document_works(
+    start: Commands, hosts: Hosts, fmu_dir: Path, tmp_path: Path
+) -> None:
+    """The commands for three hosts, one after the other, each on its host, over TLS."""
+    text = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
+    text = text.partition("## Three hosts")[2].partition("\n## ")[0]
+    for address, host in (("10.0.0.1", "router"), ("10.0.0.2", "slave"), ("10.0.0.3", "master")):
+        text = text.replace(address, hosts.addresses[host])
+    text = re.sub(r"(?<=[ =])lab(?=[ /])", str(tmp_path / "lab"), text)
+    text = re.sub(r"examples/quarter_car/(\w+)\.fmu", rf"{fmu_dir}/\1.fmu", text)
+    text = text.replace("examples/", f"{ROOT}/examples/").replace("results", f"{tmp_path}/out")
+    lines = [
+        shlex.split(line)
+        for block in re.findall(r"^```sh\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+        for line in block.splitlines()
+    ]
+    places = ["router", "router", "router", "slave", "master", "router", "router", "router"]
+    assert len(lines) == len(places)
+    for (program, *words), place in zip(lines, places, strict=True):
+        command = start(program.replace("-", "_"), *words, on=hosts.prefix(place))
+        if words[0] in ("serve", "router"):
+            command.wait_for("ready")
+        else:
+            assert command.wait() == 0, command.text
+        if words[0] == "list":
+            assert {"chassis", "wheel"} <= set(re.findall(r"\w+", command.text))
+    system = load_system(ROOT / "examples" / "quarter_car" / "displacement.toml")
+    simulate(system.model_copy(update={"base": fmu_dir}), output=tmp_path / "same", in_process=True)
+    same = (tmp_path / "same" / "results.csv").read_bytes()
+    assert (tmp_path / "out" / "results.csv").read_bytes() == same
