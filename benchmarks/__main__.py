@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import in_process, memory, over_zenoh
+from benchmarks import in_process, memory, over_zenoh, tls
 
 TABLES = {
     "over_zenoh": (
@@ -14,6 +14,11 @@ TABLES = {
         "Attempted double step in process",
         ("configuration", "attempted double step", "by hand with FMPy", "ratio"),
         in_process.run,
+    ),
+    "tls": (
+        "Attempted double step over TLS, two slave processes on loopback",
+        ("configuration", "over TLS", "over TCP", "ratio"),
+        tls.run,
     ),
     "memory": (
         "Resident memory over a million attempted double steps",
