@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from protocol.slave import CallExecutor, Slave, SlaveDescription
 from slave_node.executor import Executor
 from slave_node.model import Model, describe
 from slave_node.model_loading import load_model_class
+from slave_node.substeps import with_substeps
 
 DEFAULT = Configure()
 
@@ -46,10 +48,11 @@ def load_slave(
         from slave_node.model_slave import ModelSlave  # noqa: PLC0415  and an FMU no scipy
 
         slave = ModelSlave(_model_class(model, base))
-    if configuration != DEFAULT and configuration != Configure(slave.description.state_kind):
+    rest = replace(configuration, largest_substep=None, input_substeps=0)
+    if rest not in (DEFAULT, Configure(slave.description.state_kind)):
         slave.close()
-        raise ModelError(f"{model}: cannot be run as {configuration}")
-    return slave
+        raise ModelError(f"{model}: cannot be run as {rest}")
+    return with_substeps(slave, configuration)
 
 
 def describe_model(model: str, base: Path) -> SlaveDescription:
