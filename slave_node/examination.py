@@ -44,8 +44,11 @@ _SHRINK = 0.1
 """So often, and by so much, the trial steps are made smaller if the slave does not take them."""
 
 
+_GOES_BACK = (StateVerdict.EXACT, StateVerdict.RESTARTS_SOLVER)
+
+
 class _TrialError(Exception):
-    """A step failed before any state was restored: that says nothing about saved states."""
+    """A trial step failed, which by itself says nothing about saved states."""
 
 
 def examine(
@@ -69,31 +72,31 @@ def examine(
     """
     if slave.description.state_kind is StateKind.NONE:
         return Examination(state_reason=slave.description.state_reason)
+    fixed = slave.description.fixed_step_size
+    if fixed is not None:
+        step_size = fixed * max(1, round(step_size / fixed))
     begin = perf_counter()
     try:
         states, step_size = _test_states(slave, time, step_size)
+        clock: float | None = None
+        dependence: tuple[float, float | None] = (0.0, None)
+        if states.verdict in _GOES_BACK and _takes_any_step(slave):
+            norm = _norm(slave, relative_tolerance, absolute_tolerance)
+            with _place(slave, time) as place:
+                if perf_counter() - begin < _TIME:
+                    clock = _internal_clock(place, step_size)
+                if clock is not None and clock > step_size:
+                    place.restored()
+                    with suppress(_TrialError):
+                        states = _compare(slave, place, time, clock)
+                if clock is None and perf_counter() - begin < _TIME:
+                    dependence = _step_dependence(place, step_size, norm)
     except _TrialError as error:
         return Examination(state_reason=str(error))
     except FatalSlaveError:
         raise
     except SlaveError as error:
         return Examination(StateVerdict.BROKEN, str(error))
-    clock: float | None = None
-    dependence: tuple[float, float | None] = (0.0, None)
-    if states.verdict in (StateVerdict.EXACT, StateVerdict.RESTARTS_SOLVER):
-        try:
-            with _place(slave, time) as place:
-                if perf_counter() - begin < _TIME:
-                    clock = _internal_clock(place, step_size)
-                if clock is not None and clock > step_size:
-                    states = _compare(slave, place, time, clock)
-                if clock is None and perf_counter() - begin < _TIME:
-                    norm = _norm(slave, relative_tolerance, absolute_tolerance)
-                    dependence = _step_dependence(place, step_size, norm)
-        except FatalSlaveError:
-            raise
-        except (SlaveError, _TrialError) as error:
-            return Examination(StateVerdict.BROKEN, str(error))
     return Examination(states.verdict, states.reason, states.difference, clock, *dependence)
 
 
@@ -120,24 +123,19 @@ def _read(slave: Slave) -> _Reading:
 
 
 def _step(slave: Slave, time: float, step_size: float) -> _Reading:
-    result = slave.do_step(time, step_size, False)
-    if result.status is not StepStatus.OK:
-        raise SlaveError(f"a trial step ended with {result.status}", time=time, step_size=step_size)
-    reading = _read(slave)
-    if not np.isfinite(reading.values).all():
-        raise SlaveError(
-            "an output is not finite after a trial step", time=time, step_size=step_size
-        )
-    return reading
-
-
-def _first_step(slave: Slave, time: float, step_size: float) -> _Reading:
+    where = f"a step of {step_size!r} s at t={time!r} s"
     try:
-        return _step(slave, time, step_size)
+        result = slave.do_step(time, step_size, False)
+        if result.status is not StepStatus.OK:
+            raise _TrialError(f"{where} ended with {result.status}")
+        reading = _read(slave)
     except FatalSlaveError:
         raise
     except SlaveError as error:
-        raise _TrialError(str(error)) from None
+        raise _TrialError(f"{where}: {error.cause}") from None
+    if not np.isfinite(reading.values).all():
+        raise _TrialError(f"{where}: an output is not finite")
+    return reading
 
 
 class _Place:
@@ -166,17 +164,6 @@ class _Place:
     def free(self) -> None:
         """Give the saved state up."""
         self._slave.free_state(self._state)
-
-
-@contextmanager
-def _failure_allowed() -> Iterator[None]:
-    """For a step after which the slave goes back anyway."""
-    try:
-        yield
-    except FatalSlaveError:
-        raise
-    except SlaveError:
-        pass
 
 
 @contextmanager
@@ -231,26 +218,29 @@ def _compare(slave: Slave, origin: _Place, time: float, step_size: float) -> _St
     The state is saved after a first step: by then a model's solver has a past, and outputs may be
     read (FMI 2.0 forbids it between setting inputs and a step).
     """
+    first = _step(slave, time, step_size)
     middle = time + step_size
-    first = _first_step(slave, time, step_size)
     place = _Place(slave, middle)
     with _freed(place):
-        without = [_first_step(slave, middle + i * step_size, step_size) for i in range(2)]
-        place.restored()
-        there = _read(slave)
-        once = [place.step(step_size)]
-        place.restored()
-        again = [place.step(step_size), place.step(step_size)]
-        with _failure_allowed():
-            place.step(2.0 * step_size)
-        origin.restored()
-        from_origin = _step(slave, time, step_size)
-        origin.restored()
-    if not once[0].equals(again[0]):
+        without = [_step(slave, middle + i * step_size, step_size) for i in range(2)]
+        try:
+            place.restored()
+            there = _read(slave)
+            once = place.step(step_size)
+            place.restored()
+            again = [place.step(step_size), place.step(step_size)]
+            with suppress(_TrialError):
+                place.step(2.0 * step_size if _takes_any_step(slave) else step_size)
+            origin.restored()
+            from_origin = origin.step(step_size)
+            origin.restored()
+        except _TrialError as error:
+            raise SlaveError(f"after a restore {error}") from None
+    if not once.equals(again[0]):
         return _States(
             StateVerdict.DOES_NOT_REPEAT,
             "the same step after a restore gave other outputs the second time",
-            _difference(once[0], again[0]),
+            _difference(once, again[0]),
         )
     pairs = [*zip(without, again, strict=True), (first, from_origin)]
     if not all(a.equals(b) for a, b in pairs):
@@ -265,8 +255,16 @@ def _compare(slave: Slave, origin: _Place, time: float, step_size: float) -> _St
             "outputs right after a restore are not those that were saved; after a step they are",
             _difference(first, there),
         )
-    moves = any(a.has_moved_from(first) for a in without)
+    moves = any(reading.has_moved_from(first) for reading in without)
     return _States(StateVerdict.EXACT, "" if moves else "no output moved in the trial steps")
+
+
+def _takes_any_step(slave: Slave) -> bool:
+    description = slave.description
+    return (
+        description.capabilities.can_handle_variable_step_size
+        and description.fixed_step_size is None
+    )
 
 
 def _difference(a: _Reading, b: _Reading) -> float:
@@ -293,14 +291,15 @@ _BISECTIONS = 24
 def _internal_clock(place: _Place, step_size: float) -> float | None:
     """At multiples of which time the outputs move [s]; None if at any time, or not at all."""
     size = step_size
-    for _ in range(_LEVELS):
-        moves = _moves(place, size)
-        ticks = [i for i, moved in enumerate(moves) if moved]
-        if not ticks:
-            return None
-        if len(ticks) < len(moves):
-            return _period(place, size, moves, ticks)
-        size /= _FINER
+    with suppress(_TrialError):  # a step that is too short for the model
+        for _ in range(_LEVELS):
+            moves = _moves(place, size)
+            ticks = [i for i, moved in enumerate(moves) if moved]
+            if not ticks:
+                return None
+            if len(ticks) < len(moves):
+                return _period(place, size, moves, ticks)
+            size /= _FINER
     return None
 
 
@@ -394,17 +393,13 @@ def _step_dependence(place: _Place, step_size: float, norm: Norm) -> tuple[float
     halved until it is `_ALLOWED` of it; None where there is no need, or no such h.
     """
     largest = 0.0
-    for factor in _LARGER:
-        size = factor * step_size
-        try:
+    with suppress(_TrialError):  # a step that is too long for the model
+        for factor in _LARGER:
+            size = factor * step_size
             difference = _halves(place, size, norm)
-        except FatalSlaveError:
-            raise
-        except SlaveError:  # a step that is too long for the model
-            break
-        largest = max(largest, difference)
-        if difference > _NOTICED:
-            return difference, _allowed_size(place, size, difference, norm)
+            largest = max(largest, difference)
+            if difference > _NOTICED:
+                return difference, _allowed_size(place, size, difference, norm)
     return largest, None
 
 
@@ -418,10 +413,11 @@ def _halves(place: _Place, size: float, norm: Norm) -> float:
 
 
 def _allowed_size(place: _Place, size: float, difference: float, norm: Norm) -> float | None:
-    for _ in range(_HALVINGS):
-        size *= 0.5
-        last, difference = difference, _halves(place, size, norm)
-        if difference <= _ALLOWED:  # between this size and twice of it, by a power law
-            room = log(_ALLOWED / difference) / log(last / difference) if difference else 0.0
-            return float(size * 2.0**room)
+    with suppress(_TrialError):
+        for _ in range(_HALVINGS):
+            size *= 0.5
+            last, difference = difference, _halves(place, size, norm)
+            if difference <= _ALLOWED:  # between this size and twice of it, by a power law
+                room = log(_ALLOWED / difference) / log(last / difference) if difference else 0.0
+                return float(size * 2.0**room)
     return None

@@ -7,9 +7,9 @@ values. Held in a slave x' = A x + B u in place of u, c leaves at the end of the
 
 so what counts are the moments of c - u. With the mean values of u over the substeps the first
 moment is right and the second one wrong, by u' H^3 / (12 N^2). Here as many moments are right as N
-and u have coefficients: the first min(N, k + 1). With N = k + 1 the error is of order H^(k+3), one more
-than that of the extrapolation, however coarse the substeps. Of all values with these moments those
-next to the mean values are taken.
+and u have coefficients: the first min(N, k + 1). With N = k + 1 the error is of order H^(k+3), one
+more than that of the extrapolation. Of all values with these moments those next to the mean values
+are taken.
 
 Where an input enters nonlinearly its square counts too, and c misses some of it: x' = f(u) is wrong
 by f'' u'^2 H^3 / (24 N^2). That is what more substeps are for: `substeps_needed`.
