@@ -43,7 +43,7 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
                 "(canGetAndSetFMUstate), so steps cannot be controlled",
                 remedy="use --estimator none with a fixed --step-size",
             )
-        fixed = system.slaves[part.name].step_size
+        fixed = system.slaves[part.name].step_size or part.description.fixed_step_size
         if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:
             raise ConfigurationError(
                 f"{part.name}: the model cannot handle variable communication step sizes",
@@ -77,12 +77,15 @@ class CoSimulation:
         coupled: their connections.
         system: the settings.
         observer: is told of everything.
+        y: outputs at T_0 of slaves that stand there already, shape (rows, m); None: they are
+            still to be initialized.
     """
 
     group: SlaveGroup
     coupled: CoupledSystem
     system: System
     observer: Observer
+    y: FloatArray | None = None
 
     def run(self) -> Statistics:
         """Initialize, step to the stop time, terminate.
@@ -95,7 +98,9 @@ class CoSimulation:
         """
         settings = self.system.simulation
         scheme = CouplingScheme.of(self.coupled, self.system)
-        y = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
+        y = self.y
+        if y is None:
+            y = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
         self.group.restart_statistics()
         statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
         self.observer.started(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from master_node.configuration import System
 from master_node.numerics.step_size_limits import (
     SlaveLimits,
@@ -9,6 +11,22 @@ from master_node.numerics.step_size_limits import (
     StepSizeLimitsError,
 )
 from protocol.errors import ConfigurationError
+from protocol.slave import SlaveDescription
+
+
+def with_fixed_steps(system: System, descriptions: Mapping[str, SlaveDescription]) -> System:
+    """The system with a ``step_multiple`` for each slave whose model takes steps of one size.
+
+    Its node splits a communication step into as many of them. Given rules of the slave win.
+    """
+    rules = {
+        name: {"step_multiple": description.fixed_step_size}
+        for name, description in descriptions.items()
+        if description.fixed_step_size is not None
+        and system.slaves[name].step_size is None
+        and system.slaves[name].step_multiple is None
+    }
+    return system.with_slaves(rules) if rules else system
 
 
 def step_size_limits(system: System) -> StepSizeLimits:

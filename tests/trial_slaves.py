@@ -166,5 +166,3 @@ def described(slave: Slave, **fields: Any) -> Slave:
     """The slave with another description."""
     slave.description = replace(slave.description, **fields)
     return slave
-
-
