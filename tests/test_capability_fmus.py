@@ -7,19 +7,25 @@ from __future__ import annotations
 
 import math
 import struct
+import sys
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import psutil
 import pytest
+from fmpy import fmi2
 from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 
 from tests.capability_fmus import (
+    DISCARD,
     ERROR,
     Extracted,
     Model2,
@@ -90,7 +96,7 @@ def test_fmus_are_valid(capability_dir: Path) -> None:
     """Archive and model description of every FMU keep the rules of their version of FMI."""
     fmus = sorted(capability_dir.glob("*.fmu"))
     problems = {fmu.stem: validate_fmu(str(fmu)) for fmu in fmus}
-    assert len(fmus) >= 18
+    assert len(fmus) == 47
     assert {name: found for name, found in problems.items() if found} == {}
 
 
@@ -400,3 +406,576 @@ def test_quarter_car_as_model_exchange(instance: Open, half: str, kind: type) ->
     slave.set(**inputs(half, 0.3))
     slave.step(0.1)
     np.testing.assert_allclose(solution.y[:, -1], slave.get("x", "v"), rtol=1e-7, atol=1e-9)
+
+
+# ---- Lags ---------------------------------------------------------------------------------------
+
+
+def lag(x: float, u: float, time: float, slope: float = 0.0) -> float:
+    """T y' = u + slope t - y with T = 0.5 s, from y = x on."""
+    t_c = 0.5
+    settled = u + slope * (time - t_c)
+    return settled + (x - u + slope * t_c) * math.exp(-time / t_c)
+
+
+def started(made: Any, u: float = 3.0) -> Any:
+    """An initialized lag with its input set."""
+    made.initialize()
+    made.set(u=u)
+    return made
+
+
+SOUND_LAGS = (
+    "broken_state",
+    "error_on_restore",
+    "starts_thread",
+    "writes_file",
+    "strict_point",
+    "execution_tool",
+)
+
+
+@pytest.mark.parametrize("name", [*SOUND_LAGS, "restarting_solver"])
+def test_lags_follow_their_inputs(instance: Open, name: str) -> None:
+    """As long as nothing is restored, these lags are right: with an input along a line, too."""
+    made = started(instance(Slave2, name))
+    made.set_derivatives(1, u=-2.0)
+    for step_size in (0.1, 0.03, 0.2):
+        made.step(step_size)
+    assert made.get("y")[0] == pytest.approx(lag(1.0, 3.0, 0.33, -2.0), rel=1e-7)
+    assert made.get("u")[0] == pytest.approx(3.0 - 2.0 * 0.33)
+    (slope,) = made.fmu.getRealOutputDerivatives(made.content.references(["y"]), [1])
+    assert slope == pytest.approx((made.get("u")[0] - made.get("y")[0]) / 0.5)
+
+
+def after_restoring(made: Any, step_size: float = 0.05) -> list[float]:
+    """The output after a step, and after the same step from the restored state, twice."""
+    made.step(0.05)
+    saved, time = made.save(), made.time
+    outputs = []
+    for _ in range(3):
+        made.step(step_size)
+        outputs += made.get("y")
+        made.restore(saved, time)
+    return outputs
+
+
+def test_broken_state_goes_on_from_where_it_stands(instance: Open) -> None:
+    """broken_state reports success and does not restore x."""
+    outputs = after_restoring(started(instance(Slave2, "broken_state")))
+    expected = [lag(1.0, 3.0, 0.05 * n) for n in (2, 3, 4)]
+    np.testing.assert_allclose(outputs, expected, rtol=1e-12)
+
+
+def test_restarting_solver_repeats_itself_but_not_the_first_run(instance: Open) -> None:
+    """restarting_solver: bit for bit the same after each restore, other late digits than before."""
+    first, second, third = after_restoring(started(instance(Slave2, "restarting_solver")))
+    assert bits([second]) == bits([third])
+    assert first != second
+    assert first == pytest.approx(second, rel=1e-7)
+
+
+def test_not_repeating_never_repeats(instance: Open) -> None:
+    """not_repeating: the same step from the same state ends elsewhere each time, by a millionth."""
+    outputs = after_restoring(started(instance(Slave2, "not_repeating")))
+    assert len(set(outputs)) == 3
+    np.testing.assert_allclose(outputs, lag(1.0, 3.0, 0.1), atol=2e-6)
+
+
+def test_error_on_restore_is_an_error(instance: Open) -> None:
+    """error_on_restore saves its state, refuses to restore it and stays where it is."""
+    made = started(instance(Slave2, "error_on_restore"))
+    saved = made.save()
+    made.step(0.1)
+    assert "set back" in refusal(made, lambda: made.restore(saved, 0.0))
+    made.step(0.1)
+    assert made.get("y")[0] == pytest.approx(lag(1.0, 3.0, 0.2), rel=1e-12)
+
+
+def test_starts_thread_has_one(instance: Open, extract: Callable[[str], Extracted]) -> None:
+    """starts_thread: a thread more with the instance, one less without it; no saved states."""
+
+    def threads() -> int:
+        return len(psutil.Process().threads())
+
+    before = threads()
+    made = Slave2(extract("starts_thread"))
+    assert threads() == before + 1
+    assert "saved" in refusal(made, made.save)
+    made.free()
+    deadline = monotonic() + 10.0
+    while threads() > before and monotonic() < deadline:
+        sleep(0.01)  # joined, but the system may still count it
+    assert threads() == before
+
+
+def test_writes_file_writes_each_step(instance: Open) -> None:
+    """writes_file: a line for each step in its resources, and no saved states."""
+    made = started(instance(Slave2, "writes_file"))
+    assert "saved" in refusal(made, made.save)
+    made.step(0.1)
+    made.step(0.2)
+    text = (Path(made.content.folder) / "resources" / "steps.txt").read_text()
+    *_, first, second = (line.split() for line in text.splitlines())
+    assert [float(word) for word in first] == [0.0, 0.1, pytest.approx(lag(1.0, 3.0, 0.1))]
+    assert [float(word) for word in second] == [0.1, 0.2, *made.get("y")]
+
+
+@pytest.mark.parametrize(("name", "kind"), [("fixed_step", Slave2), ("fixed_step_fmi3", Slave3)])
+def test_fixed_step_takes_no_other(instance: Open, name: str, kind: type) -> None:
+    """Steps of 10 ms, whichever way the times are added up, and no others."""
+    made = started(instance(kind, name))
+    flags = made.content.description.coSimulation
+    assert not flags.canHandleVariableCommunicationStepSize
+    for step_size in (0.005, 0.0100001, 0.025):
+        assert "0.01" in refusal(made, partial(made.step, step_size))
+    for i in range(200):
+        made.time = i * 0.01
+        made.step((i + 1) * 0.01 - i * 0.01)
+    assert made.get("y")[0] == pytest.approx(lag(1.0, 3.0, 2.0), rel=1e-12)
+    assert "fixed one" in refusal(made, partial(made.step, 0.02))
+
+
+def test_fixed_step_fmi3_takes_equal_multiples(instance: Open) -> None:
+    """fixed_step_fmi3 declares its internal step; the first step chooses the multiple."""
+    made = started(instance(Slave3, "fixed_step_fmi3"))
+    assert made.content.description.coSimulation.fixedInternalStepSize == "0.01"
+    made.step(0.03)
+    made.step(0.03)
+    assert "fixed one" in refusal(made, partial(made.step, 0.01))
+    assert made.get("y")[0] == pytest.approx(lag(1.0, 3.0, 0.06), rel=1e-12)
+
+
+def test_discards_ends_after_two_milliseconds(instance: Open) -> None:
+    """Discards: a longer step ends there, says where, and a restored state leads back."""
+    made = started(instance(Slave2, "discards"))
+    made.step(0.002)
+    saved = made.save()
+    refusal(made, partial(made.step, 0.01), DISCARD)
+    assert made.fmu.getRealStatus(fmi2.fmi2LastSuccessfulTime) == pytest.approx(0.004)
+    assert made.fmu.getStatus(fmi2.fmi2DoStepStatus) == DISCARD
+    assert not made.fmu.getBooleanStatus(fmi2.fmi2Terminated)
+    assert made.get("y")[0] == pytest.approx(lag(1.0, 3.0, 0.004), rel=1e-12)
+    assert "step discarded" in refusal(made, partial(made.step, 0.001))
+    made.restore(saved, 0.002)
+    made.step(0.002)
+    assert made.get("y")[0] == pytest.approx(lag(1.0, 3.0, 0.004), rel=1e-12)
+
+
+def test_large_state_is_large_and_whole(instance: Open) -> None:
+    """large_state: more than 1 MiB, and every part that the output shows is restored."""
+    made, other = (started(instance(Slave2, "large_state")) for _ in range(2))
+    made.step(0.1)
+    block = made.fmu.serializeFMUstate(made.save())
+    assert len(block) > 2**20
+    made.step(0.1)
+    other.restore(other.fmu.deSerializeFMUstate(block), 0.1)
+    other.set(u=3.0)
+    other.step(0.1)
+    assert bits(made.get("y")) == bits(other.get("y"))
+    exact = np.mean([3.0 - 2.0 * math.exp(-0.2 / t_c) for t_c in (0.5, 0.75, 1.0)])
+    assert made.get("y")[0] == pytest.approx(exact, rel=1e-5)
+
+
+def test_internal_clock_moves_at_its_ticks_only(instance: Open) -> None:
+    """internal_clock: any step is taken, the output moves at multiples of 10 ms by Euler steps."""
+    made = started(instance(Slave2, "internal_clock"))
+    assert made.content.description.coSimulation.canHandleVariableCommunicationStepSize
+    x = 1.0
+    for end, ticks in ((0.004, 0), (0.0099, 0), (0.01, 1), (0.019, 0), (0.021, 1), (0.05, 3)):
+        for _ in range(ticks):
+            x += 0.01 * (3.0 - x) / 0.5
+        made.step(end - made.time)
+        made.time = end
+        assert made.get("y")[0] == pytest.approx(x, rel=1e-14), end
+    saved = made.save()
+    made.step(0.1)
+    once = made.get("y")
+    made.restore(saved, 0.05)
+    made.step(0.1)
+    assert made.get("y") == once
+
+
+def test_euler_per_step_is_that(instance: Open) -> None:
+    """euler_per_step: one Euler step per communication step, exactly."""
+    made = started(instance(Slave2, "euler_per_step"))
+    made.step(0.25)
+    assert made.get("y") == [1.0 + 0.25 * (3.0 - 1.0) / 0.5]
+    made.step(0.125)
+    assert made.get("y") == [2.0 + 0.125 * (3.0 - 2.0) / 0.5]
+
+
+@pytest.mark.parametrize("name", ["strict_point", "execution_tool"])
+def test_strict_point_compares_bits(instance: Open, name: str) -> None:
+    """A communication point one unit in the last place beside it: only strict_point refuses."""
+    made = started(instance(Slave2, name))
+    made.step(0.1)
+    made.step(0.2)
+    assert made.time == 0.1 + 0.2 != 0.3
+    made.time = 0.3
+    if name == "strict_point":
+        assert "stands at" in refusal(made, partial(made.step, 0.1))
+        made.time = 0.1 + 0.2
+    assert "not advance" in refusal(made, partial(made.step, 0.0))
+    made.step(0.1)
+
+
+# ---- Ends and events ----------------------------------------------------------------------------
+
+
+def test_terminates2_discards_the_step_and_says_why(instance: Open) -> None:
+    """terminates2: fmi2Discard, fmi2Terminated, and the last successful time is 0.5."""
+    made = started(instance(Slave2, "terminates2"))
+    made.step(0.4)
+    refusal(made, partial(made.step, 0.2), DISCARD)
+    assert made.fmu.getBooleanStatus(fmi2.fmi2Terminated)
+    assert made.fmu.getRealStatus(fmi2.fmi2LastSuccessfulTime) == 0.5
+    assert made.get("y")[0] == pytest.approx(lag(1.0, 3.0, 0.5), rel=1e-12)
+    made.fmu.terminate()
+
+
+def test_terminates3_takes_the_step_and_asks_for_the_end(instance: Open) -> None:
+    """terminates3: terminateSimulation with the step that reaches 0.5, and no step after it."""
+    made = started(instance(Slave3, "terminates3"))
+    assert made.step(0.4) == (False, False, False, 0.4)
+    assert made.step(0.2) == (False, True, False, 0.4 + 0.2)
+    assert "step" in refusal(made, partial(made.step, 0.1))
+    assert made.get("y")[0] == pytest.approx(lag(1.0, 3.0, 0.6), rel=1e-12)
+    made.fmu.terminate()
+
+
+def staircase(time: float) -> tuple[int, float]:
+    """Level and output of event_mode3, which rises at every multiple of 0.35."""
+    now, x, level = 0.0, 1.0, 0
+    while 0.35 * (level + 1) <= time:
+        x = lag(x, level, 0.35 * (level + 1) - now)
+        now = 0.35 * (level + 1)
+        level += 1
+    return level, lag(x, level, time - now)
+
+
+def test_event_mode3_handles_events_itself_when_told_so(instance: Open) -> None:
+    """Without event mode, and without leave to return early, steps pass over the events."""
+    for arguments in ({}, {"eventModeUsed": True}):
+        made = instance(Slave3, "event_mode3", **arguments)
+        made.initialize()
+        if arguments:
+            made.fmu.updateDiscreteStates()
+            made.fmu.enterStepMode()
+        for step_size in (0.2, 0.3, 0.6):
+            event, terminate, early, _ = made.step(step_size)
+            assert (event, terminate, early) == (False, False, False)
+            level, y = staircase(made.time)
+            assert made.get("level") == [level]
+            assert made.get("y")[0] == pytest.approx(y, rel=1e-12)
+
+
+def test_event_mode3_returns_early_at_its_events(instance: Open) -> None:
+    """With event mode a step ends at 0.35, the event is handled there, and the run goes on."""
+    made = instance(Slave3, "event_mode3", eventModeUsed=True, earlyReturnAllowed=True)
+    made.initialize()
+    assert "event mode" in refusal(made, partial(made.step, 0.1))
+    assert made.fmu.updateDiscreteStates() == (False, False, False, False, True, 0.35)
+    assert made.get("level") == [0]
+    made.fmu.enterStepMode()
+    assert made.step(0.2) == (False, False, False, 0.2)
+    saved = made.save()
+    for _ in range(2):
+        assert made.step(0.3) == (True, False, True, 0.35)
+        assert made.get("level") == [0]
+        assert "event mode first" in refusal(made, partial(made.step, 0.1))
+        made.fmu.enterEventMode()
+        assert made.fmu.updateDiscreteStates() == (False, False, False, False, True, 0.7)
+        assert made.get("level") == [1]
+        made.fmu.enterStepMode()
+        made.step(0.15)
+        assert made.get("y")[0] == pytest.approx(staircase(0.5)[1], rel=1e-12)
+        made.restore(saved, 0.2)
+
+
+def test_event_at_the_end_of_a_step_is_no_early_return(instance: Open) -> None:
+    """A step that ends at the event needs event handling all the same."""
+    made = instance(Slave3, "event_mode3", eventModeUsed=True, earlyReturnAllowed=True)
+    made.initialize()
+    made.fmu.enterStepMode()
+    assert made.step(0.35) == (True, False, False, 0.35)
+
+
+@pytest.mark.parametrize("kind", [Model2, Model3], ids=["me2", "me3"])
+def test_bouncing_ball_bounces_and_comes_to_rest(instance: Open, kind: type) -> None:
+    """Integrated with event location by SciPy, it bounces when theory says so, then stays down."""
+    made = instance(kind, f"bouncing_ball_{'me2' if kind is Model2 else 'me3'}")
+    made.initialize()
+    is_fmi2 = kind is Model2
+    update = made.fmu.newDiscreteStates if is_fmi2 else made.fmu.updateDiscreteStates
+    get_derivatives = made.fmu.getDerivatives if is_fmi2 else made.fmu.getContinuousStateDerivatives
+    update()
+    made.fmu.enterContinuousTimeMode()
+
+    def right_hand_side(time: float, x: np.ndarray) -> np.ndarray:
+        set_states(made, time, x)
+        return vector(get_derivatives, 2)
+
+    def indicator(time: float, x: np.ndarray) -> float:
+        set_states(made, time, x)
+        return float(vector(made.fmu.getEventIndicators, 1)[0])
+
+    indicator.terminal = True  # type: ignore[attr-defined]
+    indicator.direction = -1  # type: ignore[attr-defined]
+    time, bounces = 0.0, []
+    while time < 4.0:
+        x = vector(made.fmu.getContinuousStates, 2)
+        run = solve_ivp(right_hand_side, (time, 4.0), x, events=indicator, rtol=1e-10, atol=1e-12)
+        time = float(run.t[-1])
+        at_event = run.y[:, -1]
+        if run.status == 0:
+            set_states(made, time, at_event)
+            break
+        set_states(made, time, np.array([min(at_event[0], 0.0), at_event[1]]))
+        made.fmu.enterEventMode()
+        assert update()[3]  # the states have jumped
+        made.fmu.enterContinuousTimeMode()
+        bounces.append(time)
+        assert made.get("bounces") == [len(bounces)]
+
+    fall = math.sqrt(2.0 / 9.81)
+    expected = [fall + 2.0 * fall * sum(0.7**k for k in range(1, n + 1)) for n in range(4)]
+    np.testing.assert_allclose(bounces[:4], expected, rtol=1e-7)
+    speeds = math.sqrt(2.0 * 9.81) * 0.7 ** np.arange(1, 30)
+    assert len(bounces) == 1 + np.count_nonzero(speeds >= 0.1)
+    assert made.get("h", "v") == [0.0, 0.0]
+    assert not vector(get_derivatives, 2).any()
+
+
+# ---- Types, units, loops ------------------------------------------------------------------------
+
+
+def test_all_types2_rules(instance: Open) -> None:
+    """Every output of all_types2 follows its rule, restored text and numbers included."""
+    made = instance(Slave2, "all_types2")
+    made.initialize()
+    made.set(
+        real_continuous_in=2.0,
+        real_discrete_in=1.5,
+        integer_in=41,
+        boolean_in=True,
+        string_in="grün",
+        enumeration_in=3,
+    )
+    made.step(0.5)
+    names = [name for name in made.content.names("output") if name != "real_continuous_out"]
+    expected = [3.0, 42, 0, "got grün".encode(), 1, 2, 0]
+    assert made.get(*names) == expected
+    assert made.get("real_continuous_out")[0] == pytest.approx(2.0 - 2.0 * math.exp(-0.5))
+    saved = made.save()
+    made.set(string_in="x", integer_in=2**31 - 1, boolean_in=False, enumeration_in=1)
+    made.step(0.3)
+    assert made.get("string_out", "integer_out", "enumeration_out") == [b"got x", -(2**31), 2]
+    assert made.get("counter_out", "toggle_out", "boolean_out") == [3, 1, 1]
+    made.restore(saved, 0.5)
+    assert made.get(*names) == expected
+
+
+def test_all_types3_rules(instance: Open) -> None:
+    """Every output of all_types3 follows its rule; after the largest integer comes the least."""
+    made = instance(Slave3, "all_types3")
+    made.initialize()
+    largest = {
+        f"{'u' if unsigned else ''}int{size}": 2 ** (size if unsigned else size - 1) - 1
+        for size in (8, 16, 32, 64)
+        for unsigned in (False, True)
+    }
+    for values in (dict.fromkeys(largest, 41), largest):
+        made.set(**{f"{name}_in": value for name, value in values.items()})
+        for name, value in values.items():
+            successor = (
+                value + 1 if value == 41 else 0 if name.startswith("u") else -largest[name] - 1
+            )
+            assert made.get(f"{name}_out") == [successor], name
+    made.set(float32_in=1.5, boolean_in=True, string_in="grün", enumeration_in=2)
+    assert made.get("float32_out", "boolean_out", "enumeration_out") == [3.0, False, 3]
+    assert made.get("string_out") == ["got grün"]
+    made.fmu.setBinary(made.content.references(["binary_in"]), [b"\x00\x01\xff"])
+    assert list(made.fmu.getBinary(made.content.references(["binary_out"]))) == [b"\xff\x01\x00"]
+    made.set(matrix_in=[1.0, 2.0, 3.0, 4.0, 5.0, 6.0], vector_in=[1.0, 2.0, 3.0], float64_in=2.0)
+    matrix = made.content.references(["matrix_out"])
+    assert made.fmu.getFloat64(matrix, nValues=6) == [2.0, 4.0, 6.0, 8.0, 10.0, 12.0]
+    vector_out = made.content.references(["vector_out"])
+    assert made.fmu.getFloat64(vector_out, nValues=3) == [2.0, 3.0, 4.0]
+    assert "4 values" in refusal(made, lambda: made.fmu.getFloat64(vector_out, nValues=4))
+    made.step(0.5)
+    assert made.get("float64_out")[0] == pytest.approx(2.0 - 2.0 * math.exp(-0.5))
+
+    saved = made.save()
+    made.set(string_in="x", vector_in=[0.0, 0.0, 0.0])
+    made.restore(saved, 0.5)
+    assert made.get("string_out") == ["got grün"]
+    assert made.fmu.getFloat64(vector_out, nValues=3) == [2.0, 3.0, 4.0]
+
+
+def test_structural_parameter_sizes_the_vector(instance: Open) -> None:
+    """N of all_types3 is set in configuration mode, and only there; at most 16."""
+    made = instance(Slave3, "all_types3")
+    assert made.get("n") == [3]
+    assert "configuration mode" in refusal(made, partial(made.set, n=5))
+    made.fmu.enterConfigurationMode()
+    made.set(n=17)
+    assert "larger than 16" in refusal(made, made.fmu.exitConfigurationMode)
+    made.set(n=5)
+    made.fmu.exitConfigurationMode()
+    made.initialize()
+    made.set(vector_in=[1.0, 2.0, 3.0, 4.0, 5.0])
+    vector_out = made.content.references(["vector_out"])
+    assert made.fmu.getFloat64(vector_out, nValues=5) == [2.0, 3.0, 4.0, 5.0, 6.0]
+
+
+@pytest.mark.parametrize(("name", "count"), [("few_variables", 10), ("many_variables", 5000)])
+def test_many_variables_are_all_there(instance: Open, name: str, count: int) -> None:
+    """Every one of the lags follows its own input, and all of them are restored."""
+    made = instance(Slave2, name)
+    made.initialize()
+    inputs_, outputs = made.content.names("input"), made.content.names("output")
+    assert len(inputs_) == len(outputs) == count
+    u = np.arange(1.0, count + 1.0)
+    to, from_ = made.content.references(inputs_), made.content.references(outputs)
+    made.fmu.setReal(to, list(u))
+    made.fmu.setRealInputDerivatives(to, [1] * count, list(-u))
+    saved = made.save()
+    for _ in range(2):
+        made.step(0.3)
+        exact = u * (1.0 - 0.3 + 1.0) - u * 2.0 * math.exp(-0.3)  # y' = u (1 - t) - y
+        np.testing.assert_allclose(made.fmu.getReal(from_), exact, rtol=1e-12)
+        slopes = made.fmu.getRealOutputDerivatives(from_, [1] * count)
+        np.testing.assert_allclose(slopes, 0.7 * u - exact, rtol=1e-11)
+        made.restore(saved, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "length", "temperature"),
+    [("units_metres", (1.0, 0.0), (1.0, 0.0)), ("units_millimetres", (1e-3, 0.0), (1.0, 273.15))],
+)
+def test_units_are_declared(
+    instance: Open, name: str, length: tuple[float, float], temperature: tuple[float, float]
+) -> None:
+    """Factor and offset to the SI unit stand in the description, the temperature at rest at 0 C."""
+    made = instance(Slave2, name)
+    made.initialize()
+    units = {unit.name: unit.baseUnit for unit in made.content.description.unitDefinitions}
+    for output, base, (factor, offset) in (("y", "m", length), ("theta_out", "K", temperature)):
+        unit = units[made.content.variables[output].unit]
+        assert (unit.factor, unit.offset) == (factor, offset)
+        assert getattr(unit, base) == 1
+    made.step(0.1)
+    factor, offset = temperature
+    assert made.get("theta_out")[0] * factor + offset == pytest.approx(273.15, rel=1e-12)
+    assert made.get("y")[0] == pytest.approx(lag(1.0, 0.0, 0.1), rel=1e-12)
+
+
+def test_loop_follows_its_input_at_once(instance: Open) -> None:
+    """loop_a and loop_b: feed-through without a step, in initialization mode too; c bends it."""
+    a, b = instance(Slave2, "loop_a"), instance(Slave2, "loop_b")
+    for made, slope, offset, c in ((a, 0.5, 1.0, 0.0), (b, -0.8, 2.0, 0.3)):
+        made.fmu.setupExperiment()
+        made.set(c=c)
+        made.fmu.enterInitializationMode()
+        for u in (0.0, 2.0):
+            made.set(u=u)
+            assert made.get("y")[0] == pytest.approx(slope * u + offset + c * math.sin(u))
+        made.fmu.exitInitializationMode()
+        made.time = 0.0
+        made.set(u=1.0)
+        made.set_derivatives(1, u=2.0)
+        (rate,) = made.fmu.getRealOutputDerivatives(made.content.references(["y"]), [1])
+        assert rate == pytest.approx(2.0 * (slope + c * math.cos(1.0)))
+        made.step(0.5)
+        assert made.get("y")[0] == pytest.approx(slope * 2.0 + offset + c * math.sin(2.0))
+        (structure,) = made.content.description.outputs
+        assert [known.name for known in structure.dependencies] == ["u"]
+
+
+# ---- What cannot be had -------------------------------------------------------------------------
+
+
+def test_missing_library_cannot_be_loaded(extract: Callable[[str], Extracted]) -> None:
+    """The description is sound, the binary asks for a library that is nowhere."""
+    content = extract("missing_library")
+    with pytest.raises(Exception, match="doublestep_absent"):
+        Slave2(content)
+
+
+def test_licence_error_needs_a_licence(
+    extract: Callable[[str], Extracted], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No instance without LICENCE_FILE, and the logger is told why; with it there is one."""
+    monkeypatch.delenv("LICENCE_FILE", raising=False)
+    logged: list[tuple[bytes, bytes]] = []
+    callbacks = fmi2.fmi2CallbackFunctions()
+    callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(lambda *args: logged.append((args[3], args[4])))
+    fmu = fmi2.FMU2Slave(**extract("licence_error").arguments())
+    with pytest.raises(Exception, match="instantiate"):
+        fmu.instantiate(callbacks=callbacks)
+    message = b"fmi2Instantiate: licence not found: LICENCE_FILE is not set"
+    assert logged == [(b"logStatusError", message)]
+    monkeypatch.setenv("LICENCE_FILE", "licence.txt")
+    started(Slave2(extract("licence_error"))).free()
+
+
+def test_execution_tool_says_so(extract: Callable[[str], Extracted]) -> None:
+    """execution_tool declares that it needs its tool, and no other FMU does."""
+    assert extract("execution_tool").description.coSimulation.needsExecutionTool
+    assert not extract("strict_point").description.coSimulation.needsExecutionTool
+
+
+# ---- All of them --------------------------------------------------------------------------------
+
+NOT_TO_BE_STARTED = {"missing_library", "licence_error"}
+
+
+def test_start_values_are_those_of_the_description(
+    capability_dir: Path, extract: Callable[[str], Extracted]
+) -> None:
+    """Whoever sets no start value gets the one that the description names."""
+    for path in sorted(capability_dir.glob("*.fmu")):
+        if path.stem in NOT_TO_BE_STARTED:
+            continue
+        content = extract(path.stem)
+        version, is_model = content.description.fmiVersion[0], content.description.modelExchange
+        kind: Any = {
+            ("1", False): Slave1,
+            ("2", False): Slave2,
+            ("2", True): Model2,
+            ("3", False): Slave3,
+            ("3", True): Model3,
+        }[version, bool(is_model)]
+        made = kind(content)
+        made.initialize()
+        for name, variable in content.variables.items():
+            if variable.start is None or variable.type not in ("Real", "Float64", "Integer"):
+                continue
+            if not getattr(variable, "dimensions", ()):
+                assert made.get(name) == [float(variable.start)], (path.stem, name)
+        made.free()
+
+
+def test_archives_hold_their_sources(capability_dir: Path) -> None:
+    """Every FMU carries the sources that it was compiled from, and FMI 3.0 how to compile them."""
+    for path in capability_dir.glob("*.fmu"):
+        with zipfile.ZipFile(path) as archive:
+            names = set(archive.namelist())
+            description = archive.read("modelDescription.xml")
+            if b'fmiVersion="3.0"' in description:
+                build = ElementTree.fromstring(archive.read("sources/buildDescription.xml"))
+                files = {f"sources/{file.get('name')}" for file in build.iter("SourceFile")}
+                assert files == {name for name in names if name.endswith(".c")}
+        assert {"sources/behaviour.h", "sources/instance.c", "sources/compile_flags.txt"} <= names
+        assert not any("doublestep_absent" in name for name in names)
+
+
+def test_build_is_reproducible(capability_dir: Path, tmp_path: Path) -> None:
+    """The same sources give the same bytes, those of the stand-in library included."""
+    catalogue = sys.modules["capabilities.catalogue"]
+    names = ("wheel_fmi1", "wheel_me3", "missing_library")
+    fmus = [fmu for fmu in catalogue.FMUS if fmu.name in names]
+    for made in sys.modules["fmu_framework.build_fmus"].build(fmus, tmp_path):
+        assert made.read_bytes() == (capability_dir / made.name).read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{n}.fmu" for n in names)

@@ -9,6 +9,9 @@ from pathlib import Path
 from capabilities.model_descriptions import (
     TIME_REFERENCE,
     Description,
+    Unit,
+    Variable,
+    build_description,
     fmi1,
     fmi2,
     fmi3,
@@ -136,6 +139,7 @@ def make_fmu(
     definitions: dict[str, str] | None = None,
     libraries: tuple[str, ...] = (),
     absent_library: str | None = None,
+    documents: dict[str, bytes] | None = None,
 ) -> Fmu:
     """An FMU from a description, the sources of its behaviour and what it can do."""
     capabilities = capabilities or Capabilities()
@@ -153,16 +157,25 @@ def make_fmu(
     if kind == "ModelExchange":
         macros["MODEL_EXCHANGE"] = "1"
     front = (*_COMMON, *_FRONTS[version, kind])
+    files = (*(SOURCES / name for name in front), *sources)
+    macro_items = tuple(sorted(macros.items()))
+    documents = dict(documents or {})
+    if version == 3:
+        compiled = tuple(sorted(path.name for path in files if path.suffix == ".c"))
+        documents["sources/buildDescription.xml"] = build_description(
+            described.name, compiled, macro_items
+        )
     text = fmi1(described) if version == 1 else (fmi2, fmi3)[version - 2](described, kind)
     return Fmu(
         name=described.name,
         description=text,
-        sources=(*(SOURCES / name for name in front), *sources),
+        sources=files,
         made_by=_MADE_BY,
         fmi_version=version,
-        definitions=tuple(sorted(macros.items())),
+        definitions=macro_items,
         libraries=libraries,
         absent_library=absent_library,
+        documents=documents,
     )
 
 
@@ -214,5 +227,386 @@ def quarter_car() -> Iterator[Fmu]:
             )
 
 
-FMUS = tuple(quarter_car())
+# ---- Lags ---------------------------------------------------------------------------------------
+
+LAG = (SOURCES / "lag.h", SOURCES / "lag.c")
+LAG_CAPABILITIES = Capabilities(input_derivatives=1, output_derivatives=1)
+LAG_REFERENCES = 10
+"""How many value references each lag takes (src/lag.h)."""
+EXPERIMENT = {"startTime": "0", "stopTime": "2", "tolerance": "1e-6", "stepSize": "0.01"}
+
+
+def lag_variables(
+    *,
+    u: str = "u",
+    y: str = "y",
+    offset: int = 0,
+    unit: str | None = None,
+    prefix: str = "",
+    start: str = "0",
+    x_start: str = "1",
+) -> tuple[Variable, ...]:
+    """The variables of one lag, T y' = u - y (src/lag.h)."""
+    return (
+        Variable(u, offset, "input", start=start, unit=unit, description="Input"),
+        Variable(y, offset + 1, "output", unit=unit, depends=(), description="Follows the input"),
+        Variable(
+            f"{prefix}T",
+            offset + 2,
+            "parameter",
+            start="0.5",
+            unit="s",
+            description="Time constant",
+        ),
+        Variable(
+            f"{prefix}x_start",
+            offset + 3,
+            "parameter",
+            start=x_start,
+            unit=unit,
+            description=f"Value of {y} at the start",
+        ),
+    )
+
+
+SECOND = Unit("s", {"s": "1"})
+
+
+def lag_description(name: str, description: str, **attributes: str) -> Description:
+    """An FMU with one lag; ``attributes`` go into DefaultExperiment."""
+    return Description(
+        name=name,
+        description=description,
+        variables=lag_variables(),
+        units=(SECOND,),
+        experiment=EXPERIMENT | attributes,
+    )
+
+
+def lags() -> Iterator[Fmu]:
+    """One lag each, and what goes wrong with it."""
+    whole = LAG_CAPABILITIES
+    held = replace(whole, input_derivatives=0, output_derivatives=0)
+    no_state = replace(whole, saved_states=False)
+    for name, description, capabilities, definitions in (
+        ("broken_state", "A lag that does not restore its state", whole, {}),
+        ("restarting_solver", "A lag whose solver restarts with a restored state", whole, {}),
+        ("not_repeating", "A lag whose steps do not repeat", held, {}),
+        ("error_on_restore", "A lag that refuses to restore its state", whole, {}),
+        ("starts_thread", "A lag with a thread of its own", no_state, {}),
+        ("writes_file", "A lag that writes a file", no_state, {}),
+        ("discards", "A lag that takes no step longer than 2 ms", whole, {}),
+        ("large_state", "131 072 lags, 1 MiB of state", whole, {}),
+        ("internal_clock", "A lag that moves every 10 ms", held, {}),
+        ("euler_per_step", "A lag, one explicit Euler step per communication step", held, {}),
+        ("licence_error", "A lag that needs a licence", whole, {}),
+    ):
+        yield make_fmu(
+            lag_description(name, description),
+            (*LAG, SOURCES / f"{name}.c"),
+            capabilities=capabilities,
+            definitions=definitions,
+            libraries=("-pthread",) if name == "starts_thread" else (),
+            documents={"resources/README.txt": b"steps.txt appears here.\n"}
+            if name == "writes_file"
+            else None,
+        )
+    yield make_fmu(
+        lag_description("missing_library", "A lag whose binary cannot be loaded"),
+        (*LAG, SOURCES / "missing_library.c"),
+        capabilities=whole,
+        absent_library="doublestep_absent",
+    )
+    plain = (*LAG, SOURCES / "plain_lag.c")
+    yield make_fmu(
+        lag_description("strict_point", "A lag that takes its communication point bit by bit"),
+        plain,
+        capabilities=whole,
+        definitions={"POINT_TOLERANCE": "0.0"},
+    )
+    yield make_fmu(
+        lag_description("execution_tool", "A lag that needs the tool that it comes from"),
+        plain,
+        capabilities=replace(whole, needs_execution_tool=True),
+    )
+    yield from _fixed_steps()
+    yield from _ends()
+
+
+def _fixed_steps() -> Iterator[Fmu]:
+    fixed = Capabilities(variable_steps=False)
+    sources = (*LAG, SOURCES / "fixed_step.c")
+    yield make_fmu(
+        lag_description("fixed_step", "A lag with communication steps of 10 ms"),
+        sources,
+        capabilities=fixed,
+    )
+    yield make_fmu(
+        lag_description("fixed_step_fmi3", "A lag with equal steps, multiples of 10 ms"),
+        sources,
+        version=3,
+        capabilities=replace(fixed, fixed_internal_step_size="0.01"),
+        definitions={"ANY_MULTIPLE": "1"},
+    )
+
+
+def _ends() -> Iterator[Fmu]:
+    sources = (*LAG, SOURCES / "terminates.c")
+    yield make_fmu(
+        lag_description("terminates2", "A lag that wants to end at 0.5 s"),
+        sources,
+        capabilities=LAG_CAPABILITIES,
+        definitions={"SHORTENS": "1"},
+    )
+    yield make_fmu(
+        lag_description("terminates3", "A lag that wants to end at 0.5 s"),
+        sources,
+        version=3,
+        capabilities=Capabilities(output_derivatives=1),
+    )
+    yield make_fmu(
+        Description(
+            name="event_mode3",
+            description="A staircase with a step every 0.35 s, and a lag that follows it",
+            variables=(
+                Variable("level", LAG_REFERENCES, "output", "Int32", depends=()),
+                *lag_variables()[1:],
+            ),
+            units=(SECOND,),
+            experiment=EXPERIMENT,
+        ),
+        (*LAG, SOURCES / "event_mode.c"),
+        version=3,
+        capabilities=Capabilities(event_mode=True, returns_early=True),
+    )
+
+
+# ---- Many variables, units, loops ---------------------------------------------------------------
+
+
+def many_variables() -> Iterator[Fmu]:
+    """Lags side by side, 10 and 5000 of them."""
+    for name, count in (("few_variables", 10), ("many_variables", 5000)):
+        inputs = [Variable(f"u[{i + 1}]", i, "input", start="0") for i in range(count)]
+        outputs = [
+            Variable(f"y[{i + 1}]", 10000 + i, "output", initial="exact", start="0", depends=())
+            for i in range(count)
+        ]
+        yield make_fmu(
+            Description(
+                name=name,
+                description=f"{count} lags with a time constant of 1 s",
+                variables=(*inputs, *outputs),
+                experiment=EXPERIMENT,
+            ),
+            (SOURCES / "many_variables.c",),
+            capabilities=LAG_CAPABILITIES,
+            definitions={"VARIABLES": str(count)},
+        )
+
+
+def units() -> Iterator[Fmu]:
+    """A length and a temperature, in one unit and in another."""
+    metre, kelvin = Unit("m", {"m": "1"}), Unit("K", {"K": "1"})
+    millimetre = Unit("mm", {"m": "1", "factor": "0.001"})
+    degree = Unit("degC", {"K": "1", "offset": "273.15"})
+    for name, length, temperature, start in (
+        ("units_metres", metre, kelvin, "273.15"),
+        ("units_millimetres", millimetre, degree, "0"),
+    ):
+        yield make_fmu(
+            Description(
+                name=name,
+                description=f"Two lags, in {length.name} and in {temperature.name}",
+                variables=(
+                    *lag_variables(unit=length.name),
+                    *lag_variables(
+                        u="theta_in",
+                        y="theta_out",
+                        offset=LAG_REFERENCES,
+                        unit=temperature.name,
+                        prefix="theta_",
+                        start=start,
+                        x_start=start,
+                    ),
+                ),
+                units=(SECOND, length, temperature),
+                experiment=EXPERIMENT,
+            ),
+            (*LAG, SOURCES / "two_lags.c"),
+            capabilities=LAG_CAPABILITIES,
+            definitions={"SECOND_START": start},
+        )
+
+
+def loops() -> Iterator[Fmu]:
+    """Direct feed-through both ways."""
+    for name, a, b in (("loop_a", "0.5", "1"), ("loop_b", "-0.8", "2")):
+        yield make_fmu(
+            Description(
+                name=name,
+                description="y = a u + b + c sin(u)",
+                variables=(
+                    Variable("u", 0, "input", start="0"),
+                    Variable("y", 1, "output", depends=("u",)),
+                    Variable("a", 2, "parameter", start=a),
+                    Variable("b", 3, "parameter", start=b),
+                    Variable("c", 4, "parameter", start="0"),
+                ),
+                experiment=EXPERIMENT,
+            ),
+            (SOURCES / "loop.c",),
+            capabilities=LAG_CAPABILITIES,
+            definitions={"START_A": a, "START_B": b},
+        )
+
+
+# ---- Bouncing ball ------------------------------------------------------------------------------
+
+
+def bouncing_ball() -> Iterator[Fmu]:
+    """Model exchange with a state event."""
+    for name, version in (("bouncing_ball_me2", 2), ("bouncing_ball_me3", 3)):
+        reinit = {"reinit": "true"}
+        yield make_fmu(
+            Description(
+                name=name,
+                description="A ball that bounces and comes to rest",
+                variables=(
+                    Variable(
+                        "h",
+                        0,
+                        "output",
+                        start="1",
+                        initial="exact",
+                        unit="m",
+                        depends=("h",),
+                        extra=reinit,
+                    ),
+                    Variable(
+                        "v",
+                        1,
+                        "output",
+                        start="0",
+                        initial="exact",
+                        unit="m/s",
+                        depends=("v",),
+                        extra=reinit,
+                    ),
+                    Variable("der(h)", 2, "local", unit="m/s", derivative="h", depends=("v",)),
+                    Variable("der(v)", 3, "local", unit="m/s2", derivative="v", depends=("g",)),
+                    Variable("g", 4, "parameter", start="9.81", unit="m/s2"),
+                    Variable("e", 5, "parameter", start="0.7"),
+                    Variable("z", 6, "local", unit="m", depends=("h",)),
+                    Variable("bounces", 7, "output", "Int32", depends=()),
+                ),
+                units=(
+                    Unit("m", {"m": "1"}),
+                    Unit("m/s", {"m": "1", "s": "-1"}),
+                    Unit("m/s2", {"m": "1", "s": "-2"}),
+                ),
+                experiment=EXPERIMENT | {"stopTime": "4"},
+                event_indicators=("z",),
+            ),
+            (SOURCES / "bouncing_ball.c",),
+            version=version,
+            kind="ModelExchange",
+        )
+
+
+# ---- All types ----------------------------------------------------------------------------------
+
+COLOURS = ("Colour", ("red", "green", "blue"))
+OUT = 100
+"""Offset of the value references of outputs."""
+
+
+def all_types2() -> Fmu:
+    """Every type of FMI 2.0."""
+    discrete = {"variability": "discrete"}
+    pairs = (
+        Variable("real_continuous", 0, "", start="0"),
+        Variable("real_discrete", 1, "", start="0", **discrete),
+        Variable("integer", 2, "", "Int32", start="0"),
+        Variable("boolean", 3, "", "Boolean", start="false"),
+        Variable("string", 4, "", "String", start=""),
+        Variable("enumeration", 5, "", "Enumeration", start="1", declared_type="Colour"),
+    )
+    return make_fmu(
+        Description(
+            name="all_types2",
+            description="Inputs and outputs of every type",
+            variables=(
+                *_inputs_and_outputs(pairs, state="real_continuous"),
+                Variable("counter_out", 106, "output", "Int32", depends=()),
+                Variable("toggle_out", 107, "output", "Boolean", depends=()),
+            ),
+            enumerations=(COLOURS,),
+            experiment=EXPERIMENT,
+        ),
+        (SOURCES / "all_types2.c",),
+    )
+
+
+def all_types3() -> Fmu:
+    """Every type of FMI 3.0; value references as in src/all_types3.c."""
+    numbers = ("Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")
+    pairs = (
+        Variable("float32", 0, "", "Float32", start="0"),
+        Variable("float64", 1, "", start="0"),
+        *(Variable(kind.lower(), i, "", kind, start="0") for i, kind in enumerate(numbers, 2)),
+        Variable("boolean", 10, "", "Boolean", start="false"),
+        Variable("string", 11, "", "String", start=""),
+        Variable("binary", 12, "", "Binary", start=""),
+        Variable("enumeration", 14, "", "Enumeration", start="1", declared_type="Colour"),
+        Variable("matrix", 50, "", start="0 0 0 0 0 0", dimensions=(2, 3)),
+        Variable("vector", 51, "", start="0 0 0", dimensions=("n",)),
+    )
+    return make_fmu(
+        Description(
+            name="all_types3",
+            description="Inputs and outputs of every type, arrays and a clock",
+            variables=(
+                Variable("n", 60, "structuralParameter", "UInt64", start="3", extra={"max": "16"}),
+                *_inputs_and_outputs(pairs, state="float64"),
+                Variable(
+                    "clock",
+                    OUT + 13,
+                    "output",
+                    "Clock",
+                    extra={"intervalVariability": "triggered"},
+                ),
+            ),
+            enumerations=(COLOURS,),
+            experiment=EXPERIMENT,
+        ),
+        (SOURCES / "all_types3.c",),
+        version=3,
+    )
+
+
+def _inputs_and_outputs(pairs: tuple[Variable, ...], state: str) -> Iterator[Variable]:
+    for pair in pairs:
+        yield replace(pair, name=f"{pair.name}_in", causality="input")
+    for pair in pairs:
+        yield replace(
+            pair,
+            name=f"{pair.name}_out",
+            causality="output",
+            reference=pair.reference + OUT,
+            start=None,
+            depends=() if pair.name == state else (f"{pair.name}_in",),
+        )
+
+
+FMUS = (
+    *quarter_car(),
+    *lags(),
+    *many_variables(),
+    *units(),
+    *loops(),
+    *bouncing_ball(),
+    all_types2(),
+    all_types3(),
+)
 """All FMUs, in the order of the README."""

@@ -55,13 +55,13 @@ class Variable:
     """Further attributes, as they are called in the version of FMI."""
 
     @property
-    def effective_variability(self) -> str:
-        """The variability, or its default."""
+    def explicit_variability(self) -> str | None:
+        """The variability where it is not continuous, which is the default of FMI 2.0."""
         if self.variability is not None:
             return self.variability
         if self.causality in ("parameter", "calculatedParameter", "structuralParameter"):
             return "fixed"
-        return "continuous" if self.type in ("Float64", "Float32") else "discrete"
+        return None if self.type in ("Float64", "Float32") else "discrete"
 
     @property
     def is_initially_unknown(self) -> bool:
@@ -177,8 +177,8 @@ def fmi1(description: Description) -> bytes:
             attributes["description"] = variable.description
         if variable.causality == "parameter":
             attributes["variability"] = "parameter"
-        elif variable.variability:
-            attributes["variability"] = variable.variability
+        elif variable.explicit_variability:
+            attributes["variability"] = variable.explicit_variability
         attributes["causality"] = {"parameter": "internal", "local": "internal"}.get(
             variable.causality, variable.causality
         )
@@ -227,7 +227,7 @@ def fmi2(description: Description, kind: str = "CoSimulation") -> bytes:
                 name=variable.name,
                 valueReference=str(variable.reference),
                 causality=variable.causality,
-                variability=variable.variability,
+                variability=variable.explicit_variability,
                 initial=variable.initial,
                 description=variable.description,
             ),
@@ -311,7 +311,7 @@ def fmi3(description: Description, kind: str = "CoSimulation") -> bytes:
                 name=variable.name,
                 valueReference=str(variable.reference),
                 causality=variable.causality,
-                variability=variable.variability,
+                variability=variable.explicit_variability,
                 initial=variable.initial,
                 description=variable.description,
                 declaredType=variable.declared_type,
@@ -355,6 +355,20 @@ def fmi3(description: Description, kind: str = "CoSimulation") -> bytes:
     return _text(root)
 
 
+def build_description(
+    name: str, sources: tuple[str, ...], definitions: tuple[tuple[str, str], ...]
+) -> bytes:
+    """The ``sources/buildDescription.xml`` of an FMI 3.0 FMU."""
+    root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
+    configuration = ET.SubElement(root, "BuildConfiguration", modelIdentifier=name)
+    files = ET.SubElement(configuration, "SourceFileSet", language="C99")
+    for source in sources:
+        ET.SubElement(files, "SourceFile", name=source)
+    for definition, value in definitions:
+        ET.SubElement(files, "PreprocessorDefinition", name=definition, value=value)
+    return _text(root)
+
+
 def with_variables(description: Description, **extra: dict[str, str]) -> Description:
     """The description with more attributes for all variables of a causality."""
     return replace(
@@ -384,7 +398,6 @@ def _initial_unknowns(description: Description) -> list[Variable]:
         variable
         for variable in description.variables
         if variable.is_initially_unknown
-        and variable.type != "Clock"
         and (
             variable.causality in ("output", "calculatedParameter")
             or variable.derivative

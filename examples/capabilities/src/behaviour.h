@@ -89,6 +89,8 @@ typedef struct {
     const char *(*open)(void *hidden, const char *resources);
     void (*close)(void *hidden);
 
+    /* At the end of configuration mode: NULL, or why the structural parameters cannot be so. */
+    const char *(*check_structure)(const void *state);
     /* At the end of initialization mode. */
     void (*initialized)(void *state, double time);
     /* Bring everything that is calculated up to date. */

@@ -141,11 +141,13 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 currentCommunicationPoint,
     front->end = end;
     Step step = {.t = currentCommunicationPoint,
                  .h = communicationStepSize,
-                 .stop_at_events = front->event_mode_used,
+                 .stop_at_events = front->event_mode_used && front->early_return_allowed,
                  .importer = instance,
                  .request_inputs = calls_back ? request_inputs : NULL,
                  .finish_internal_step = calls_back ? finish_internal_step : NULL};
     const Status status = take_step(instance, __func__, &step);
+    if (status == OK && step.terminate)
+        instance->standing.mode = STEP_DISCARDED; /* no further step */
     *eventHandlingNeeded = status == OK && step.event;
     *terminateSimulation = status == OK && step.terminate;
     *earlyReturn = status == OK && step.reached < end;
@@ -157,7 +159,8 @@ fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference val
                                     size_t nValueReferences, const fmi3Int32 orders[],
                                     fmi3Float64 values[], size_t nValues)
 {
-    Instance *instance = enter(c, __func__, STEP | INTERMEDIATE_UPDATE | TERMINATED);
+    Instance *instance =
+        enter(c, __func__, STEP | STEP_DISCARDED | INTERMEDIATE_UPDATE | TERMINATED);
     if (!instance)
         return fmi3Error;
     if (nValues != nValueReferences)

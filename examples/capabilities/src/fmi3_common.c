@@ -74,7 +74,15 @@ fmi3Status fmi3EnterConfigurationMode(fmi3Instance c)
 
 fmi3Status fmi3ExitConfigurationMode(fmi3Instance c)
 {
-    return change_mode(c, __func__, CONFIGURATION, INSTANTIATED);
+    Instance *instance = enter(c, __func__, CONFIGURATION);
+    if (!instance)
+        return fmi3Error;
+    const char *reason =
+        behaviour.check_structure ? behaviour.check_structure(instance->state) : NULL;
+    if (reason)
+        return status_of(report(instance, ERROR, __func__, "%s", reason));
+    instance->standing.mode = INSTANTIATED;
+    return fmi3OK;
 }
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean toleranceDefined,

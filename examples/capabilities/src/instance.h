@@ -99,8 +99,8 @@ Status deserialize(Instance *instance, const char *function, const void *bytes, 
 /* Where they are not supported, every call on them is refused. */
 Status no_saved_states(const Instance *instance, const char *function);
 
-/* A step from `step->t` by `step->h`: checked, taken, and the mode set to what follows from it.
- * A step that ends early by an event leaves the mode as it is. */
+/* A step from `step->t` by `step->h`: checked and taken. The mode changes only if it fails; what
+ * follows from a step that ends early is up to the version of FMI. */
 Status take_step(Instance *instance, const char *function, Step *step);
 
 /* The distance of `value` to the next larger number. */
