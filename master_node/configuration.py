@@ -402,13 +402,10 @@ class System(_Table):
         simulation |= given
         return self._with(simulation=simulation)
 
-    def with_slaves(self, settings: Mapping[str, Mapping[str, Any]]) -> System:
-        """The same system with other settings of some slaves, by name."""
-        slaves = {
-            name: slave.model_dump(exclude_unset=True) | dict(settings.get(name, {}))
-            for name, slave in self.slaves.items()
-        }
-        return self._with(slaves=slaves)
+    def with_slave(self, name: str, **settings: Any) -> System:
+        """The same system with other settings of one slave."""
+        changed = self.slaves[name].model_dump(exclude_unset=True) | settings
+        return self._with(slaves={**self.slaves, name: changed})
 
     def with_bus(self, **settings: Any) -> System:
         """The same system with other bus settings; None and empty ones leave one as it is."""

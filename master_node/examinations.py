@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from master_node.configuration import SlaveSettings, System
+from master_node.configure_slaves import configuration as given_configuration
 from master_node.slave_group import Program, SlaveGroup
 from master_node.step_size_rules import check_step_sizes
 from master_node.system import CoupledSystem, SlavePart
@@ -161,14 +162,14 @@ def remedy(
     """
     verdict, reason = examination.state_verdict, examination.state_reason
     if verdict in (StateVerdict.DOES_NOT_REPEAT, StateVerdict.BROKEN):
+        what = f"{name}: its saved states ({description.state_kind}) cannot be trusted: {reason}"
+        if given_configuration(name, system).state_kind:
+            return Remedy(
+                configuration, warnings=(f"{what}; they are used as they were asked for",)
+            )
         kind = LADDER[LADDER.index(description.state_kind) + 1]
-        return Remedy(
-            replace(configuration, state_kind=kind),
-            warnings=(
-                f"{name}: its saved states ({description.state_kind}) cannot be trusted: {reason}; "
-                + ("steps cannot be taken back" if kind is StateKind.NONE else f"{kind} instead"),
-            ),
-        )
+        instead = "steps cannot be taken back" if kind is StateKind.NONE else f"{kind} instead"
+        return Remedy(replace(configuration, state_kind=kind), warnings=(f"{what}; {instead}",))
     warnings = []
     if verdict is StateVerdict.NOT_TESTED:
         warnings.append(f"{name}: its saved states could not be tested: {reason}")
@@ -212,7 +213,7 @@ def _clocked(
     if settings.step_size is not None or settings.step_multiple is not None:
         return None, configuration, f"{what}; its step sizes are left as they are given"
     try:
-        check_step_sizes(system.with_slaves({name: {"step_multiple": clock}}))
+        check_step_sizes(system.with_slave(name, step_multiple=clock))
     except ConfigurationError as error:
         return None, configuration, f"{what}, but communication steps cannot be: {error.cause}"
     is_emulated = description.input_derivatives is InputDerivatives.EMULATED

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from master_node.configuration import System
+from master_node.configure_slaves import configuration, reconfigure
 from master_node.coupling_scheme import CouplingScheme
 from master_node.examinations import (
     LADDER,
@@ -16,7 +17,6 @@ from master_node.examinations import (
     stands_where_it_stood,
 )
 from master_node.initialization import initialize
-from master_node.slave_configuration import configure
 from master_node.slave_group import SlaveGroup
 from master_node.system import resolve
 from protocol.calls import Configure, Reset
@@ -55,7 +55,6 @@ def prepare(
     group: SlaveGroup,
     system: System,
     descriptions: Mapping[str, SlaveDescription],
-    configurations: Mapping[str, Configure],
 ) -> Prepared:
     """Examine the slaves, and do about them what that calls for; warnings go to the log.
 
@@ -64,12 +63,12 @@ def prepare(
     Args:
         group: the slaves, instantiated.
         system: the settings.
-        descriptions: of the slaves.
-        configurations: as which they are loaded now.
+        descriptions: of the slaves, configured as the system says.
 
     Raises:
         DoublestepError: a slave was lost, refused to be initialized, or cannot be reset.
     """
+    configurations = {name: configuration(name, system) for name in descriptions}
     prepared = Prepared(system, descriptions, configurations)
     if system.simulation.estimator == "none" or not system.simulation.examine:
         return prepared
@@ -98,7 +97,7 @@ def _examined(group: SlaveGroup, prepared: Prepared, names: set[str]) -> tuple[P
                 warnings.append(warning)
         wanted[name] = what.configuration
         if what.step_multiple is not None:
-            system = system.with_slaves({name: {"step_multiple": what.step_multiple}})
+            system = system.with_slave(name, step_multiple=what.step_multiple)
     changed = {name for name in names if wanted[name] != prepared.configurations[name]}
     examinations = {**prepared.examinations, **found}
     prepared = replace(prepared, system=system, examinations=examinations, warnings=tuple(warnings))
@@ -129,7 +128,7 @@ def _loaded(
     for name in sorted(changed, key=group.names.index):
         while True:
             try:
-                loaded |= configure(group, {name: configurations[name]})
+                loaded |= reconfigure(group, {name: configurations[name]})
                 break
             except ModelError as error:
                 kind = configurations[name].state_kind
@@ -138,5 +137,5 @@ def _loaded(
                 following = LADDER[LADDER.index(StateKind(kind)) + 1]
                 log.warning("%s: no saved states by %s: %s", name, kind, error.cause)
                 configurations[name] = replace(configurations[name], state_kind=following)
-                group.execute([(Reset(),)], 0.0, None, [group.names.index(name)])
+                group.execute([(Reset(),)], slaves=[group.names.index(name)])
     return loaded, configurations

@@ -11,16 +11,15 @@ from typing import Any
 
 from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.configuration import System
+from master_node.configure_slaves import configure
 from master_node.examinations import as_plain_data
 from master_node.observers import Observer, Observers
-from master_node.preparation import Prepared, prepare
+from master_node.preparation import prepare
 from master_node.results import Recording, Result, ResultsWriter
-from master_node.slave_configuration import configurations_of, configure
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
 from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.system import resolve
-from protocol.calls import Configure
 from protocol.slave import SlaveDescription
 
 log = logging.getLogger("master_node")
@@ -76,37 +75,24 @@ def run(
     if writer is not None:
         writer.prepare()
     with _slaves(system, directory, in_process=in_process, launch=launch) as slaves:
+        descriptions = configure(slaves.links, system)
+        system = with_fixed_steps(system, descriptions)
+        check_step_sizes(system)
+        warnings = check_capabilities(resolve(system, descriptions), system)
+        for warning in warnings:
+            log.warning("%s", warning)
         group = SlaveGroup(slaves.links)
-        prepared = _prepared(group, system, slaves.descriptions)
+        prepared = prepare(group, system, descriptions)
         coupled = resolve(prepared.system, prepared.descriptions)
+        for warning in check_capabilities(coupled, prepared.system):
+            if warning not in warnings:
+                log.warning("%s", warning)
         if directory is not None:
             settings = settings_of(prepared.system, prepared.descriptions)
             settings["examinations"] = as_plain_data(prepared.examinations)
             writer = ResultsWriter(directory, settings)
         observer = Observers([*observers, writer] if writer is not None else observers)
         CoSimulation(group, coupled, prepared.system, observer, prepared.y).run()
-
-
-def _prepared(
-    group: SlaveGroup, system: System, descriptions: Mapping[str, SlaveDescription]
-) -> Prepared:
-    """Slaves configured, checked and examined; what the user should know goes to the log."""
-    configurations = configurations_of(system)
-    wanted = {name: c for name, c in configurations.items() if c != Configure()}
-    if wanted:
-        descriptions = {**descriptions, **configure(group, wanted)}
-    system = with_fixed_steps(system, descriptions)
-    check_step_sizes(system)
-    warnings = check_capabilities(resolve(system, descriptions), system)
-    for warning in warnings:
-        log.warning("%s", warning)
-    prepared = prepare(group, system, descriptions, configurations)
-    if prepared.descriptions is not descriptions:
-        coupled = resolve(prepared.system, prepared.descriptions)
-        for warning in check_capabilities(coupled, prepared.system):
-            if warning not in warnings:
-                log.warning("%s", warning)
-    return prepared
 
 
 @contextmanager

@@ -19,14 +19,11 @@ def with_fixed_steps(system: System, descriptions: Mapping[str, SlaveDescription
 
     Its node splits a communication step into as many of them. Given rules of the slave win.
     """
-    rules = {
-        name: {"step_multiple": description.fixed_step_size}
-        for name, description in descriptions.items()
-        if description.fixed_step_size is not None
-        and system.slaves[name].step_size is None
-        and system.slaves[name].step_multiple is None
-    }
-    return system.with_slaves(rules) if rules else system
+    for name, description in descriptions.items():
+        settings, fixed = system.slaves[name], description.fixed_step_size
+        if fixed is not None and settings.step_size is None and settings.step_multiple is None:
+            system = system.with_slave(name, step_multiple=fixed)
+    return system
 
 
 def step_size_limits(system: System) -> StepSizeLimits:

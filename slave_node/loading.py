@@ -12,7 +12,7 @@ from protocol.slave import CallExecutor, Slave, SlaveDescription
 from slave_node.executor import Executor
 from slave_node.model import Model, describe
 from slave_node.model_loading import load_model_class
-from slave_node.substeps import with_substeps
+from slave_node.substeps import input_derivatives, with_substeps
 
 DEFAULT = Configure()
 
@@ -64,8 +64,10 @@ def describe_model(model: str, base: Path) -> SlaveDescription:
     if _is_fmu(model):
         from slave_node.fmu.description import describe_fmu  # noqa: PLC0415  as above
 
-        return describe_fmu((base / model).resolve())
-    return describe(_model_class(model, base))
+        description = describe_fmu((base / model).resolve())
+    else:
+        description = describe(_model_class(model, base))
+    return replace(description, input_derivatives=input_derivatives(description))
 
 
 def _is_fmu(model: str) -> bool:

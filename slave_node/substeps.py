@@ -27,6 +27,8 @@ from protocol.slave import (
 )
 from slave_node.substep_inputs import substep_values, substeps_needed
 
+DEFAULT = Configure()
+
 _OK = StepStatus.OK
 _DEFAULT_TOLERANCE = 1e-6
 _LAST_SUBSTEP = 1.0 / 16.0
@@ -39,27 +41,38 @@ _MAGIC = b"2StepSub"
 _HEADER = struct.Struct("<8sHId")  # magic, rows, columns, where the slave stands
 
 
-def with_substeps(slave: Slave, configuration: Configure) -> Slave:
-    """The slave as ``configuration`` wants its steps split; the slave itself if not at all.
+def input_derivatives(
+    description: SlaveDescription, configuration: Configure = DEFAULT
+) -> InputDerivatives:
+    """How a model follows polynomial inputs, by itself or with the help of its slave node.
 
-    A model without input derivatives is emulated, unless ``input_substeps`` is 1. Given 1 or more
-    holds for a model with input derivatives too. One that does not take steps of any size is not
-    split, so it gets the mean values of its inputs over each step.
+    One without input derivatives is emulated, unless ``input_substeps`` is 1. A number that is
+    given holds for a model with input derivatives too.
+    """
+    derivatives = description.input_derivatives
+    if not any(v.is_continuous_real for v in description.of(Causality.INPUT)):
+        return derivatives
+    if configuration.input_substeps == 1:
+        return InputDerivatives.NONE
+    if configuration.input_substeps or derivatives is InputDerivatives.NONE:
+        return InputDerivatives.EMULATED
+    return derivatives
+
+
+def with_substeps(slave: Slave, configuration: Configure = DEFAULT) -> Slave:
+    """The slave with its steps split as ``configuration`` wants it; itself if they are not.
+
+    A model that takes communication steps of one unknown size only is not split, so it gets the
+    mean values of its inputs over each step.
     """
     description = slave.description
-    number = configuration.input_substeps
-    inputs = [v for v in description.of(Causality.INPUT) if v.is_continuous_real]
-    derivatives = description.input_derivatives
-    if inputs and number:
-        derivatives = InputDerivatives.NONE if number == 1 else InputDerivatives.EMULATED
-    elif inputs and derivatives is InputDerivatives.NONE:
-        derivatives = InputDerivatives.EMULATED
-    takes_any = description.capabilities.can_handle_variable_step_size
-    if not number and not takes_any and description.fixed_step_size is None:
-        number = 1
+    derivatives = input_derivatives(description, configuration)
     splits = configuration.largest_substep is not None or description.fixed_step_size is not None
     if derivatives is description.input_derivatives and not splits:
         return slave
+    number = configuration.input_substeps
+    if not description.capabilities.can_handle_variable_step_size and not splits:
+        number = number or 1
     return SubstepSlave(slave, derivatives, number, configuration.largest_substep)
 
 
