@@ -4,6 +4,7 @@ Before a run each slave that saves its state takes trial steps from its first co
 and goes back (`Examine`). What that shows may call for
 
 * another way to save states: native -> fork -> replay -> none;
+* emulated input derivatives, for a model that declares them and refuses some;
 * substeps within the slave's node, for a model whose own steps must not be long;
 * communication steps on the grid of an internal clock.
 
@@ -21,12 +22,13 @@ import numpy as np
 
 from master_node.configuration import SlaveSettings, System
 from master_node.configure_slaves import configuration as given_configuration
+from master_node.coupling_scheme import largest_order
 from master_node.slave_group import Program, SlaveGroup
 from master_node.step_size_rules import check_step_sizes
 from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import Configure, Examine, GetState, Reply, SetInputs, SetState
 from protocol.errors import ConfigurationError, FatalSlaveError, SlaveError
-from protocol.signals import FloatArray
+from protocol.signals import MAX_ORDER, FloatArray
 from protocol.slave import (
     Examination,
     InputDerivatives,
@@ -45,6 +47,24 @@ _BEFORE = 0
 """The number under which the state is saved meanwhile."""
 
 _TOO_LARGE = 1.0
+
+
+class Finding(NamedTuple):
+    """What a slave showed.
+
+    Attributes:
+        examination: of its trial steps.
+        refusal: why it does not take input derivatives of the degree that the run may use; "" if it
+            does. Without them there were no trial steps.
+    """
+
+    examination: Examination
+    refusal: str = ""
+
+    @property
+    def is_harmless(self) -> bool:
+        """Whether the slave stands where it stood, and needs no reset."""
+        return self.examination.state_verdict is StateVerdict.EXACT
 
 
 class Remedy(NamedTuple):
@@ -68,7 +88,7 @@ def is_to_be_examined(description: SlaveDescription) -> bool:
 
 def examine(
     group: SlaveGroup, coupled: CoupledSystem, system: System, y: FloatArray, names: set[str]
-) -> dict[str, Examination]:
+) -> dict[str, Finding]:
     """Let some slaves take trial steps, all at once.
 
     The inputs are moved a little for that, and set back with all the rest.
@@ -94,13 +114,16 @@ def examine(
 def _program(part: SlavePart, system: System, u: FloatArray) -> Program:
     simulation = system.simulation
     settings = system.slaves[part.name]
+    is_native = part.description.input_derivatives is InputDerivatives.NATIVE
+    order = min(largest_order(part), simulation.polynomial.order) if is_native else 0
     values = u[part.input_slice]
     nominal = [part.description.variable(name).nominal for name in part.inputs]
-    moved = values + _EXCITATION * np.maximum(np.abs(values), nominal)
+    moved = np.zeros((order + 1, len(values)))
+    moved[0] = values + _EXCITATION * np.maximum(np.abs(values), nominal)
     relative, absolute = settings.relative_tolerance, settings.absolute_tolerance
     return (
         GetState(_BEFORE),
-        SetInputs(moved[np.newaxis]),
+        SetInputs(moved),
         Examine(
             float(simulation.start_time),
             _trial_step_size(simulation.step_size, settings),
@@ -125,28 +148,25 @@ def _trial_step_size(step_size: float, settings: SlaveSettings) -> float:
     return step_size
 
 
-def _judged(reply: Reply) -> Examination:
+def _judged(reply: Reply) -> Finding:
     """What a slave showed; an error on the way is a verdict too."""
     examination = next((r for r in reply.results if isinstance(r, Examination)), None)
     error = reply.error
     if error is None:
         assert examination is not None
-        return examination
+        return Finding(examination)
     if not isinstance(error, SlaveError) or isinstance(error, FatalSlaveError):
         raise error
+    if error.phase == SetInputs.verb:
+        return Finding(Examination(), error.cause)
     if examination is None or examination.state_verdict is StateVerdict.EXACT:
-        return Examination(StateVerdict.BROKEN, f"{error.phase}: {error.cause}")
-    return examination
-
-
-def stands_where_it_stood(examination: Examination) -> bool:
-    """Whether a slave needs no reset after its examination."""
-    return examination.state_verdict is StateVerdict.EXACT
+        return Finding(Examination(StateVerdict.BROKEN, f"{error.phase}: {error.cause}"))
+    return Finding(examination)
 
 
 def remedy(
     name: str,
-    examination: Examination,
+    finding: Finding,
     description: SlaveDescription,
     configuration: Configure,
     system: System,
@@ -155,12 +175,20 @@ def remedy(
 
     Args:
         name: of the slave.
-        examination: what it showed.
+        finding: what it showed.
         description: of the slave as it was examined.
         configuration: as which it was examined.
         system: the settings; what the user says there is left as it is.
     """
+    examination, refusal = finding
     verdict, reason = examination.state_verdict, examination.state_reason
+    if refusal and description.input_derivatives is InputDerivatives.NATIVE:
+        return Remedy(
+            replace(configuration, input_substeps=MAX_ORDER + 1),
+            warnings=(f"{name}: it refuses input derivatives, so they are emulated: {refusal}",),
+        )
+    if refusal:
+        raise SlaveError(refusal, slave=name, phase=SetInputs.verb)
     if verdict in (StateVerdict.DOES_NOT_REPEAT, StateVerdict.BROKEN):
         what = f"{name}: its saved states ({description.state_kind}) cannot be trusted: {reason}"
         if given_configuration(name, system).state_kind:

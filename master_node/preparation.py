@@ -14,7 +14,6 @@ from master_node.examinations import (
     examine,
     is_to_be_examined,
     remedy,
-    stands_where_it_stood,
 )
 from master_node.initialization import initialize
 from master_node.slave_group import SlaveGroup
@@ -89,8 +88,8 @@ def _examined(group: SlaveGroup, prepared: Prepared, names: set[str]) -> tuple[P
     found = examine(group, coupled, system, y, names)
     wanted = dict(prepared.configurations)
     warnings = list(prepared.warnings)
-    for name, examination in found.items():
-        what = remedy(name, examination, descriptions[name], wanted[name], system)
+    for name, finding in found.items():
+        what = remedy(name, finding, descriptions[name], wanted[name], system)
         for warning in what.warnings:
             if warning not in warnings:
                 log.warning("%s", warning)
@@ -99,9 +98,10 @@ def _examined(group: SlaveGroup, prepared: Prepared, names: set[str]) -> tuple[P
         if what.step_multiple is not None:
             system = system.with_slave(name, step_multiple=what.step_multiple)
     changed = {name for name in names if wanted[name] != prepared.configurations[name]}
-    examinations = {**prepared.examinations, **found}
+    examinations = dict(prepared.examinations)
+    examinations |= {name: finding.examination for name, finding in found.items()}
     prepared = replace(prepared, system=system, examinations=examinations, warnings=tuple(warnings))
-    if not changed and all(map(stands_where_it_stood, found.values())):
+    if not changed and all(finding.is_harmless for finding in found.values()):
         return replace(prepared, y=y), set()
     _reset(group, float(system.simulation.start_time))
     descriptions, wanted = _loaded(group, descriptions, wanted, changed)

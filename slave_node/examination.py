@@ -285,7 +285,7 @@ _ALL_MOVE = 8
 """After so many steps in a row that move an output there is no clock longer than they are."""
 
 _STEPS = 40
-_TICKS = 4
+_TICKS = 3
 _BISECTIONS = 24
 
 
@@ -295,45 +295,47 @@ def _internal_clock(place: _Place, step_size: float) -> float | None:
     with suppress(_TrialError):  # a step that is too short for the model
         for _ in range(_LEVELS):
             moves = _moves(place, size)
-            ticks = [i for i, moved in enumerate(moves) if moved]
-            if not ticks:
+            if not any(moves):
                 return None
-            if len(ticks) < len(moves):
-                return _period(place, size, moves, ticks)
+            if not all(moves):
+                return _period(place, size, moves)
             size /= _FINER
     return None
 
 
 def _moves(place: _Place, size: float) -> list[bool]:
-    """Which steps move an output, beginning with the second one."""
+    """Which steps move an output, beginning with the second one.
+
+    Up to the third one that does so after one that does not.
+    """
     place.restored()
     last = place.step(size)
     moves: list[bool] = []
-    ticks = 0
-    while len(moves) < (3 * _STEPS if ticks else _STEPS):
+    while len(moves) < (3 * _STEPS if any(moves) else _STEPS):
         following = place.step(size)
         moves.append(following.has_moved_from(last))
         last = following
-        ticks += moves[-1]
-        if ticks == (_ALL_MOVE if all(moves) else _TICKS):
+        if len(_clear_ticks(moves)) == _TICKS or (len(moves) == _ALL_MOVE and all(moves)):
             break
     return moves
 
 
-def _period(place: _Place, size: float, moves: list[bool], ticks: list[int]) -> float | None:
+def _clear_ticks(moves: list[bool]) -> list[int]:
+    """The steps that move an output after one that does not: no tiny step is needed to bisect."""
+    return [i for i in range(1, len(moves)) if moves[i] and not moves[i - 1]]
+
+
+def _period(place: _Place, size: float, moves: list[bool]) -> float | None:
     """The time between equally distant ticks; None if they are not."""
+    ticks = [i for i, moved in enumerate(moves) if moved]
     gaps = [b - a for a, b in pairwise(ticks)]
-    if len(gaps) < 2 or max(gaps) - min(gaps) > 1:
+    clear = _clear_ticks(moves)
+    if len(clear) < _TICKS or max(gaps) - min(gaps) > 1:
         return None
-    # Behind a step that moves nothing, so that the steps of the bisection are not tiny.
-    clear = [i for i in ticks if i > 0 and not moves[i - 1]]
     first, last = clear[0], clear[-1]
-    number = ticks.index(last) - ticks.index(first)
-    if not number:
-        return None
     begin, end = (_tick(place, size, i) for i in (first, last))
     accuracy = 4.0 * size * 0.5**_BISECTIONS
-    return _plain((end - begin) / number, accuracy)
+    return _plain((end - begin) / (ticks.index(last) - ticks.index(first)), accuracy)
 
 
 def _tick(place: _Place, size: float, index: int) -> float:
