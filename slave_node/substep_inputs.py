@@ -18,7 +18,7 @@ by f'' u'^2 H^3 / (24 N^2). That is what more substeps are for: `substeps_needed
 from __future__ import annotations
 
 from functools import lru_cache
-from math import ceil, factorial, sqrt
+from math import ceil, sqrt
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legint, legval
@@ -32,29 +32,37 @@ _GAUSS_POINTS = 4
 """Exact for polynomials of degree 7: P_3 times a cubic and one more."""
 
 
-def substep_values(
-    derivatives: FloatArray, step_size: float, lengths: tuple[float, ...], *, meets_end: bool
-) -> FloatArray:
-    """One constant value for each substep.
+def scaled(derivatives: FloatArray, step_size: float) -> FloatArray:
+    """H^j / j! u^(j): the polynomial in units of its step.
 
     Args:
         derivatives: of the inputs at the beginning of the step, shape (k + 1, n), [u]/s^j.
         step_size: H [s].
+
+    Returns:
+        Shape (k + 1, n), unit [u].
+    """
+    rows = derivatives.copy()
+    power = 1.0
+    for j in range(1, len(rows)):
+        power *= step_size / j
+        rows[j] *= power
+    return rows
+
+
+def substep_values(rows: FloatArray, lengths: tuple[float, ...], *, meets_end: bool) -> FloatArray:
+    """One constant value for each substep.
+
+    Args:
+        rows: of the polynomial, `scaled`, shape (k + 1, n).
         lengths: of the N substeps in units of H; their sum is 1.
         meets_end: the value in the last substep is u(T + H).
 
     Returns:
         Shape (N, n), unit [u].
     """
-    rows = len(derivatives)
-    scaled = derivatives * _powers(step_size, rows)
-    values: FloatArray = substep_weights(lengths, rows, meets_end=meets_end) @ scaled
+    values: FloatArray = substep_weights(lengths, len(rows), meets_end=meets_end) @ rows
     return values
-
-
-def _powers(step_size: float, rows: int) -> FloatArray:
-    """H^j / j!, shape (rows, 1)."""
-    return np.array([[step_size**j / factorial(j)] for j in range(rows)])
 
 
 @lru_cache(maxsize=256)
@@ -88,9 +96,7 @@ def _unit(degree: int) -> list[float]:
     return [0.0] * degree + [1.0]
 
 
-def substeps_needed(
-    derivatives: FloatArray, step_size: float, nominal: FloatArray, tolerance: float
-) -> int:
+def substeps_needed(rows: FloatArray, nominal: FloatArray, tolerance: float) -> int:
     """How many equal substeps an accuracy needs, from 1 to `MAX_SUBSTEPS`.
 
     k + 1 for the order. And let r be the relative change of an input in the step, |u - u(T)| /
@@ -100,20 +106,18 @@ def substeps_needed(
         r^3 / (24 N^2) <= tolerance
 
     Args:
-        derivatives: of the inputs at the beginning of the step, shape (k + 1, n), [u]/s^j.
-        step_size: H [s].
+        rows: of the polynomial, `scaled`, shape (k + 1, n).
         nominal: typical sizes of the inputs, shape (n,), unit [u].
         tolerance: relative, that of the slave's own solver.
     """
-    rows = len(derivatives)
-    if rows == 1 or not nominal.size:
+    if len(rows) == 1 or not nominal.size:
         return 1
-    changes = np.abs(derivatives[1:] * _powers(step_size, rows)[1:]).sum(axis=0)
-    change = float((changes / np.maximum(np.abs(derivatives[0]), nominal)).max())
+    sizes = np.abs(rows)
+    change = float((sizes[1:].sum(axis=0) / np.maximum(sizes[0], nominal)).max())
     if not change < np.inf:  # the step fails anyway
-        return rows
+        return len(rows)
     needed = ceil(min(change * sqrt(change / (24.0 * tolerance)), MAX_SUBSTEPS))
-    return max(rows, needed)
+    return max(len(rows), needed)
 
 
 assert MAX_ORDER + 1 <= _GAUSS_POINTS

@@ -25,7 +25,7 @@ from protocol.slave import (
     StartValue,
     StepStatus,
 )
-from slave_node.substep_inputs import substep_values, substeps_needed
+from slave_node.substep_inputs import scaled, substep_values, substeps_needed
 
 DEFAULT = Configure()
 
@@ -231,15 +231,16 @@ class SubstepSlave(Slave):
         begin, end = self._begin(communication_point, step_size), communication_point + step_size
         inputs = self._inputs
         is_emulated = self._derivatives is InputDerivatives.EMULATED and inputs.order > 0
-        number, is_free = self._split(inputs, step_size)
+        rows = scaled(inputs.derivatives, step_size) if is_emulated else None
+        number, is_free = self._split(rows, step_size)
         meets_end = is_emulated and self._meets_end and is_free and not self._follows
         lengths = _lengths(number, meets_end=meets_end)
         last = len(lengths) - 1
-        if is_emulated:
-            values = substep_values(inputs.derivatives, step_size, lengths, meets_end=meets_end)
+        if rows is not None:
+            values = substep_values(rows, lengths, meets_end=meets_end)
         time, offset = begin, 0.0
         for i, length in enumerate(lengths):
-            if is_emulated:
+            if rows is not None:
                 self._slave.set_inputs(values[i : i + 1])
             elif i and inputs.order > 0:
                 self._slave.set_inputs(inputs.shifted(time - begin).derivatives)
@@ -269,8 +270,11 @@ class SubstepSlave(Slave):
         is_there = abs(self._standing - communication_point) <= rounding
         return self._standing if is_there else communication_point
 
-    def _split(self, inputs: InputSignal, step_size: float) -> tuple[int, bool]:
-        """How many substeps, and whether they may have any length."""
+    def _split(self, rows: FloatArray | None, step_size: float) -> tuple[int, bool]:
+        """How many substeps, and whether they may have any length.
+
+        ``rows`` are those of the polynomial, `scaled`, if it is to be emulated.
+        """
         for size in (self._fixed, self._largest):
             if size is not None:
                 number = round(step_size / size)
@@ -279,10 +283,8 @@ class SubstepSlave(Slave):
         if self._fixed is not None:
             return 1, False  # for the model to refuse
         number = 1
-        if self._derivatives is InputDerivatives.EMULATED and inputs.order > 0:
-            number = self._number or substeps_needed(
-                inputs.derivatives, step_size, self._nominal, self._tolerance
-            )
+        if rows is not None:
+            number = self._number or substeps_needed(rows, self._nominal, self._tolerance)
         if self._largest is not None:
             number = max(number, math.ceil(step_size / self._largest))
         return number, self.description.capabilities.can_handle_variable_step_size

@@ -19,7 +19,7 @@ from protocol.calls import Configure, StepResult
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.slave import InputDerivatives, Slave, StepStatus
 from slave_node.loading import describe_model, load_slave
-from slave_node.substep_inputs import MAX_SUBSTEPS, substep_values, substeps_needed
+from slave_node.substep_inputs import MAX_SUBSTEPS, scaled, substep_values, substeps_needed
 from slave_node.substeps import SubstepSlave, with_substeps
 from tests.quarter_car_case import ALL, CHASSIS, CHASSIS_FORCE, WHEEL_FORCE, car, global_errors
 from tests.trial_slaves import BoundedSlave, TimedSlave, described
@@ -73,7 +73,7 @@ def test_the_first_moments_are_those_of_the_polynomial(
     if meets_end:
         lengths = np.append(lengths, 0.1)
     lengths /= lengths.sum()
-    values = substep_values(rows, step_size, tuple(lengths), meets_end=meets_end)
+    values = substep_values(scaled(rows, step_size), tuple(lengths), meets_end=meets_end)
     u = [Polynomial(row) for row in (rows.T / [math.factorial(j) for j in range(order + 1)])]
     if meets_end:
         assert values[-1] == pytest.approx([p(step_size) for p in u], rel=1e-12)
@@ -90,7 +90,7 @@ def test_many_substeps_have_the_mean_values() -> None:
     """The more substeps, the nearer each value is to the mean of the polynomial in it."""
     rows, far = polynomial_rows(3), []
     for number in (8, 32, 128):
-        values = substep_values(rows, 1.0, (1.0 / number,) * number, meets_end=False)
+        values = substep_values(scaled(rows, 1.0), (1.0 / number,) * number, meets_end=False)
         edges = np.linspace(0.0, 1.0, number + 1)
         p = [Polynomial(row) for row in (rows.T / [1.0, 1.0, 2.0, 6.0])]
         means = np.stack([np.diff(q.integ()(edges)) * number for q in p], axis=1)
@@ -104,11 +104,11 @@ def test_the_number_of_substeps_follows_the_accuracy(
 ) -> None:
     """One for constant inputs, k + 1 at least, more for larger changes and smaller tolerances."""
     rows, sizes = polynomial_rows(order, scale), np.full(2, nominal)
-    number = substeps_needed(rows, 0.1, sizes, tolerance)
+    number = substeps_needed(scaled(rows, 0.1), sizes, tolerance)
     assert order + 1 <= number <= max(MAX_SUBSTEPS, order + 1)
-    assert number >= substeps_needed(rows, 0.05, sizes, tolerance)
-    assert number >= substeps_needed(rows, 0.1, sizes, 2.0 * tolerance)
-    assert number >= substeps_needed(rows, 0.1, 2.0 * sizes, tolerance)
+    assert number >= substeps_needed(scaled(rows, 0.05), sizes, tolerance)
+    assert number >= substeps_needed(scaled(rows, 0.1), sizes, 2.0 * tolerance)
+    assert number >= substeps_needed(scaled(rows, 0.1), 2.0 * sizes, tolerance)
     if order == 0:
         assert number == 1
 
@@ -117,7 +117,7 @@ def test_inputs_that_are_not_finite_have_a_number_too() -> None:
     """NaN and infinity are for the error control to find, not for a rounding to fail on."""
     for bad in (math.nan, math.inf):
         rows = np.array([[0.0], [bad]])
-        assert substeps_needed(rows, 0.1, np.ones(1), 1e-6) == 2
+        assert substeps_needed(rows, np.ones(1), 1e-6) == 2
 
 
 # ---- Wrapping -----------------------------------------------------------------------------------
