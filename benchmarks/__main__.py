@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import in_process, memory, over_zenoh, tls
+from benchmarks import emulated_inputs, in_process, memory, over_zenoh, tls
 
 TABLES = {
     "over_zenoh": (
@@ -19,6 +19,11 @@ TABLES = {
         "Attempted double step over TLS, two slave processes on loopback",
         ("configuration", "over TLS", "over TCP", "ratio"),
         tls.run,
+    ),
+    "emulated_inputs": (
+        "Inputs followed natively / emulated / held, quarter car",
+        ("configuration", "accepted steps", "mean error", "slaves' time for a do_step"),
+        emulated_inputs.run,
     ),
     "memory": (
         "Resident memory over a million attempted double steps",

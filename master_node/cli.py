@@ -111,6 +111,9 @@ def run(  # noqa: PLR0917  options of the command line
     pin: Annotated[
         bool, typer.Option("--pin", help="Keep each launched slave on one processor.")
     ] = False,
+    no_examine: Annotated[
+        bool, typer.Option("--no-examine", help="Let the slaves take no trial steps first.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
 ) -> None:
@@ -139,6 +142,7 @@ def run(  # noqa: PLR0917  options of the command line
                 start_time=start_time,
                 stop_time=stop_time,
                 initial_step_size=step_size,
+                examine=False if no_examine else None,
             )
             .with_bus(
                 connect=tuple(connect or ()),

@@ -124,6 +124,7 @@ class SimulationSettings(_Table):
             ``none`` where the order is chosen, else ``rest``.
         output_interval: write results at start_time + i output_interval [s], by dense output,
             instead of at the communication points.
+        examine: let the slaves take trial steps before the first step, see ``examinations.py``.
     """
 
     preset: Literal["paper"] | None = None
@@ -149,6 +150,7 @@ class SimulationSettings(_Table):
     largest_step_size: Positive | None = None
     initial_history: Literal["rest", "none"] | None = None
     output_interval: Positive | None = None
+    examine: StrictBool = True
 
     @model_validator(mode="before")
     @classmethod
@@ -305,6 +307,10 @@ class SlaveSettings(_Table):
         smallest_step_size, largest_step_size: bounds of its communication steps [s].
         outputs_follow_inputs: whether its outputs can be read again after inputs were set, without
             a step in between (FMI 2.0 does not promise it); default: what is known of its kind.
+        input_substeps: into how many substeps its node splits each step, with constant inputs in
+            each, to follow polynomial inputs; 1: the inputs are constant in each step; 0: input
+            derivatives where the model takes them, else as many substeps as the accuracy needs.
+        largest_substep: its node splits steps so that no step of the model is longer [s].
     """
 
     model: StrictStr | None = None
@@ -317,6 +323,8 @@ class SlaveSettings(_Table):
     smallest_step_size: Positive | None = None
     largest_step_size: Positive | None = None
     outputs_follow_inputs: StrictBool | None = None
+    input_substeps: Annotated[StrictInt, Field(ge=0, le=10_000)] = 0
+    largest_substep: Positive | None = None
 
 
 class Connection(_Table):
@@ -561,6 +569,11 @@ class System(_Table):
             simulation |= {**_PAPER, "order": _PAPER["order"] if order == "auto" else order}
         simulation |= given
         return self._with(simulation=simulation)
+
+    def with_slave(self, name: str, **settings: Any) -> System:
+        """The same system with other settings of one slave."""
+        changed = self.slaves[name].model_dump(exclude_unset=True) | settings
+        return self._with(slaves={**self.slaves, name: changed})
 
     def with_bus(self, **settings: Any) -> System:
         """The same system with other bus settings; None and empty ones leave one as it is."""

@@ -12,6 +12,12 @@ _STATE = {
     "none": "cannot be saved: only a fixed communication step is possible (--estimator none)",
 }
 
+_INPUTS = {
+    "native": "yes",
+    "emulated": "no: its steps are split into substeps",
+    "none": "no",
+}
+
 
 def description_tables(description: SlaveDescription) -> list[Table]:
     """The model, its variables and its capabilities as tables."""
@@ -28,7 +34,7 @@ def _model(description: SlaveDescription) -> Table:
         "sha256": description.sha256,
         "state": _STATE.get(description.state_kind, description.state_kind),
         "state can be serialized": _yes(can.can_serialize_state),
-        "interpolates inputs": _yes(can.can_interpolate_inputs),
+        "interpolates inputs": _INPUTS[description.input_derivatives],
         "output derivatives up to order": str(can.max_output_derivative_order),
         "variable communication step size": _yes(can.can_handle_variable_step_size),
         "outputs follow inputs without a step": _yes(can.outputs_follow_inputs),

@@ -12,6 +12,7 @@ from protocol.slave import CallExecutor, Slave, SlaveDescription
 from slave_node.executor import Executor
 from slave_node.model import Model, describe
 from slave_node.model_loading import load_model_class
+from slave_node.substeps import input_derivatives, with_substeps
 
 DEFAULT = Configure()
 
@@ -54,10 +55,11 @@ def load_slave(
         from slave_node.model_slave import ModelSlave  # noqa: PLC0415  and an FMU no scipy
 
         slave = ModelSlave(_model_class(model, base))
-    if configuration != DEFAULT and configuration != Configure(slave.description.state_kind):
+    rest = replace(configuration, largest_substep=None, input_substeps=0)
+    if rest not in (DEFAULT, Configure(slave.description.state_kind)):
         slave.close()
-        raise ModelError(f"{model}: cannot be run as {configuration}")
-    return slave
+        raise ModelError(f"{model}: cannot be run as {rest}")
+    return with_substeps(slave, configuration)
 
 
 def describe_model(model: str, base: Path) -> SlaveDescription:
@@ -69,8 +71,10 @@ def describe_model(model: str, base: Path) -> SlaveDescription:
     if _is_fmu(model):
         from slave_node.fmu.description import describe_fmu  # noqa: PLC0415  as above
 
-        return describe_fmu((base / model).resolve())
-    return describe(_model_class(model, base))
+        description = describe_fmu((base / model).resolve())
+    else:
+        description = describe(_model_class(model, base))
+    return replace(description, input_derivatives=input_derivatives(description))
 
 
 def _is_fmu(model: str) -> bool:
