@@ -58,6 +58,10 @@ def run(  # noqa: PLR0917  options of the command line
     step_size: Annotated[
         float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
     ] = None,
+    state: Annotated[
+        str | None,
+        typer.Option(help="How all slaves save their states: native, fork, replay or none."),
+    ] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Run the slaves in this process, without a bus.")
     ] = False,
@@ -108,6 +112,7 @@ def run(  # noqa: PLR0917  options of the command line
                 stop_time=stop_time,
                 initial_step_size=step_size,
             )
+            .with_slaves(state=state)
             .with_bus(
                 connect=tuple(connect or ()),
                 listen=tuple(listen or ()),

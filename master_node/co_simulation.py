@@ -24,6 +24,7 @@ from master_node.system import CoupledSystem
 from protocol.calls import Terminate
 from protocol.errors import ConfigurationError, InterruptedRunError
 from protocol.signals import FloatArray
+from protocol.slave import StateKind
 
 
 def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
@@ -37,10 +38,11 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
     warnings = []
     for part in coupled.parts:
         can = part.description.capabilities
-        if settings.estimator != "none" and not can.can_get_and_set_state:
+        saves_state = part.description.state_kind is not StateKind.NONE
+        if settings.estimator != "none" and not saves_state:
             raise ConfigurationError(
-                f"{part.name}: the model cannot save and restore its state "
-                "(canGetAndSetFMUstate), so steps cannot be controlled",
+                f"{part.name}: its state cannot be saved and restored, so steps cannot be "
+                f"controlled: {part.description.state_reason or 'the slave says so'}",
                 remedy="use --estimator none with a fixed --step-size",
             )
         fixed = system.slaves[part.name].step_size

@@ -284,6 +284,7 @@ class SlaveSettings(_Table):
         smallest_step_size, largest_step_size: bounds of its communication steps [s].
         outputs_follow_inputs: whether its outputs can be read again after inputs were set, without
             a step in between (FMI 2.0 does not promise it); default: what is known of its kind.
+        state: how its state is saved; default: the best way that the model and its host allow.
     """
 
     model: StrictStr | None = None
@@ -296,6 +297,7 @@ class SlaveSettings(_Table):
     smallest_step_size: Positive | None = None
     largest_step_size: Positive | None = None
     outputs_follow_inputs: StrictBool | None = None
+    state: Literal["native", "fork", "replay", "none"] | None = None
 
 
 class Connection(_Table):
@@ -393,6 +395,15 @@ class System(_Table):
             simulation |= {**_PAPER, "order": _PAPER["order"] if order == "auto" else order}
         simulation |= given
         return self._with(simulation=simulation)
+
+    def with_slaves(self, **settings: Any) -> System:
+        """The same system with these settings in the tables of all slaves; None leaves one as is."""
+        given = {name: value for name, value in settings.items() if value is not None}
+        slaves = {
+            name: slave.model_dump(exclude_unset=True) | given
+            for name, slave in self.slaves.items()
+        }
+        return self._with(slaves=slaves)
 
     def with_bus(self, **settings: Any) -> System:
         """The same system with other bus settings; None and empty ones leave one as it is."""

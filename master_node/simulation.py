@@ -11,6 +11,7 @@ from typing import Any
 
 from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.configuration import System
+from master_node.configure_slaves import configure
 from master_node.observers import Observer, Observers
 from master_node.results import Recording, Result, ResultsWriter
 from master_node.slave_group import SlaveGroup
@@ -72,11 +73,12 @@ def run(
     if writer is not None:
         writer.prepare()
     with _slaves(system, directory, in_process=in_process, launch=launch) as slaves:
-        coupled = resolve(system, slaves.descriptions)
+        descriptions = configure(slaves.links, system)
+        coupled = resolve(system, descriptions)
         for warning in check_capabilities(coupled, system):
             log.warning("%s", warning)
         if directory is not None:
-            writer = ResultsWriter(directory, settings_of(system, slaves.descriptions))
+            writer = ResultsWriter(directory, settings_of(system, descriptions))
         observer = Observers([*observers, writer] if writer is not None else observers)
         CoSimulation(SlaveGroup(slaves.links), coupled, system, observer).run()
 
