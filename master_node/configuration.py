@@ -397,7 +397,7 @@ class System(_Table):
         return self._with(simulation=simulation)
 
     def with_slaves(self, **settings: Any) -> System:
-        """The same system with these settings in the tables of all slaves; None leaves one as is."""
+        """The same system with other settings of all slaves; None leaves one as it is."""
         given = {name: value for name, value in settings.items() if value is not None}
         slaves = {
             name: slave.model_dump(exclude_unset=True) | given

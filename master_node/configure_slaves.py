@@ -14,7 +14,8 @@ from protocol.slave import SlaveDescription
 def configure(links: Mapping[str, SlaveLink], system: System) -> dict[str, SlaveDescription]:
     """Configure all slaves, also those for which the system says nothing.
 
-    A slave may still be as the last master wanted it; one that is as this one wants it does nothing.
+    A slave may still be as its last master wanted it. One that is as this one wants it has nothing
+    to do.
 
     Args:
         links: to the slaves, instantiated.

@@ -5,11 +5,11 @@ A call takes one byte, and eight more for each number that it carries.
 
 from __future__ import annotations
 
+import struct
 import sys
 import zlib
 from array import array
 from collections.abc import Iterator
-from struct import Struct, error as StructError
 
 import numpy as np
 
@@ -30,8 +30,8 @@ from protocol.slave import StartValue
 
 _MAGIC = b"2StepRec"
 _VERSION = 1
-_HEADER = Struct("<8sHIQQQQ")  # magic, version, CRC of the body, sizes of its four parts
-_LENGTH = Struct("<Q")
+_HEADER = struct.Struct("<8sHIQQQQ")  # magic, version, CRC of the body, sizes of its four parts
+_LENGTH = struct.Struct("<Q")
 
 _SET_INPUTS = 0  # plus the highest row
 _GET_OUTPUTS = 8  # plus the order
@@ -153,7 +153,7 @@ class CallRecord:
         """
         try:
             return _read(data)
-        except (StructError, DoublestepError, ValueError) as error:
+        except (struct.error, DoublestepError, ValueError) as error:
             raise SlaveError(f"not a saved state of a slave that is replayed: {error}") from error
 
 

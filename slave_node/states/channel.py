@@ -18,16 +18,21 @@ _CHUNK = 2**20
 class Message(IntEnum):
     """What a message is about. Each one that asks is answered by ``DONE`` or ``REFUSED``.
 
-    ``LOAD``: load the model that a map tells. ``PROGRAM``: execute it. ``FORK``: make a copy that
-    serves the socket that follows. ``CLOSE``: free the model.
+    ``LOAD``: load the model that a map tells. ``STEP``: take a step, see ``step_message.py``.
+    ``PROGRAM``: execute any other calls. ``FORK``: make a copy that serves the socket that
+    follows. ``CLOSE``: free the model.
     """
 
     LOAD = 0
-    PROGRAM = 1
-    FORK = 2
-    CLOSE = 3
-    DONE = 4
-    REFUSED = 5
+    STEP = 1
+    PROGRAM = 2
+    FORK = 3
+    CLOSE = 4
+    DONE = 5
+    REFUSED = 6
+
+
+_MESSAGES = tuple(Message)
 
 
 class Channel:
@@ -53,7 +58,7 @@ class Channel:
         """The descriptor."""
         return self._socket.fileno()
 
-    def send(self, kind: int, payload: bytes = b"") -> None:
+    def send(self, kind: Message, payload: bytes = b"") -> None:
         """Send one message.
 
         Raises:
@@ -61,14 +66,14 @@ class Channel:
         """
         self._socket.sendall(_HEADER.pack(kind, len(payload)) + payload)
 
-    def receive(self) -> tuple[int, bytes]:
+    def receive(self) -> tuple[Message, bytes]:
         """Wait for one message.
 
         Raises:
             EOFError, OSError: the other end is gone.
         """
         kind, size = _HEADER.unpack(self._exactly(_HEADER.size))
-        return kind, self._exactly(size)
+        return _MESSAGES[kind], self._exactly(size)
 
     def wait(self, timeout: float) -> bool:
         """Whether a message, or the end, comes within ``timeout`` seconds."""

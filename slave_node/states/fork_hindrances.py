@@ -10,9 +10,10 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Set as AbstractSet
-from contextlib import suppress
 from fcntl import F_GETFL, fcntl
 from pathlib import Path
+
+from protocol.errors import SlaveError
 
 _TASKS = "/proc/self/task"
 _DESCRIPTORS = "/proc/self/fd"
@@ -29,64 +30,66 @@ class ForkHindrances:
     def __init__(self) -> None:
         self._descriptors = _open_descriptors()
         self._shared_memory = _shared_memory()
-        self._was_asked = False
+        self._was_checked = False
 
-    def find(self, ours: AbstractSet[int]) -> str:
-        """Why this process must not be forked now; "" if it may.
+    def check(self, ours: AbstractSet[int]) -> list[Reader]:
+        """Whether this process may be forked now.
 
         Args:
             ours: descriptors that were opened since and that the model does not know.
-        """
-        found = self._threads() or self._files(ours)
-        if not found and not self._was_asked:
-            found = self._processes() or self._memory()
-        self._was_asked = True
-        return found
 
-    def readers(self, ours: AbstractSet[int]) -> list[Reader]:
-        """The files that the model reads, for `reopen` in the copy."""
-        readers = []
-        for descriptor in _open_descriptors() - self._descriptors - ours:
-            with suppress(OSError):  # the one of the listing itself, or a device
-                if stat.S_ISREG(os.fstat(descriptor).st_mode):
-                    readers.append((descriptor, os.lseek(descriptor, 0, os.SEEK_CUR)))
+        Returns:
+            The files that the model reads, for `reopen` in the copy.
+
+        Raises:
+            SlaveError: it must not be, with what the model has.
+        """
+        threads = len(os.listdir(_TASKS)) - 1  # noqa: PTH208  names are all that is needed
+        if threads:
+            raise SlaveError(f"the model runs {threads} more thread{'s' * (threads > 1)}")
+        opened = _open_descriptors() - self._descriptors - ours
+        readers = [reader for reader in map(_reader, sorted(opened)) if reader is not None]
+        if not self._was_checked:  # what is costly to find out, and hardly comes later
+            self._check_processes()
+            self._check_memory()
+            self._was_checked = True
         return readers
 
     @staticmethod
-    def _threads() -> str:
-        threads = len(os.listdir(_TASKS)) - 1  # noqa: PTH208  names are all that is needed
-        return f"the model runs {threads} more thread{'s' * (threads > 1)}" if threads else ""
-
-    def _files(self, ours: AbstractSet[int]) -> str:
-        for descriptor in sorted(_open_descriptors() - self._descriptors - ours):
-            try:
-                mode = os.fstat(descriptor).st_mode
-                target = os.readlink(f"{_DESCRIPTORS}/{descriptor}")
-                writes = fcntl(descriptor, F_GETFL) & os.O_ACCMODE != os.O_RDONLY
-            except OSError:  # the one of the listing itself
-                continue
-            if target in _HARMLESS_DEVICES or stat.S_ISDIR(mode):
-                continue
-            if stat.S_ISSOCK(mode):
-                return f"the model holds a socket ({target})"
-            if not stat.S_ISREG(mode):
-                return f"the model holds a device or a pipe ({target})"
-            if writes:
-                return f"the model writes to the file {target}"
-        return ""
-
-    @staticmethod
-    def _processes() -> str:
+    def _check_processes() -> None:
         try:
             children = Path(f"{_TASKS}/{os.getpid()}/children").read_text(encoding="ascii").split()
         except OSError:  # this kernel does not tell
-            return ""
-        return f"the model started process {children[0]}" if children else ""
+            return
+        if children:
+            raise SlaveError(f"the model started process {children[0]}")
 
-    def _memory(self) -> str:
+    def _check_memory(self) -> None:
         for area in sorted(_shared_memory() - self._shared_memory):
-            return f"the model shares memory with other processes ({area})"
-        return ""
+            raise SlaveError(f"the model shares memory with other processes ({area})")
+
+
+def _reader(descriptor: int) -> Reader | None:
+    """The file behind a descriptor if it is read; None if it does not matter.
+
+    Raises:
+        SlaveError: the file is written, or is none.
+    """
+    try:
+        mode = os.fstat(descriptor).st_mode
+        target = str(Path(f"{_DESCRIPTORS}/{descriptor}").readlink())
+        flags = fcntl(descriptor, F_GETFL)
+    except OSError:  # the one of the listing itself
+        return None
+    if target in _HARMLESS_DEVICES or stat.S_ISDIR(mode):
+        return None
+    if stat.S_ISSOCK(mode):
+        raise SlaveError(f"the model holds a socket ({target})")
+    if not stat.S_ISREG(mode):
+        raise SlaveError(f"the model holds a device or a pipe ({target})")
+    if flags & os.O_ACCMODE != os.O_RDONLY:
+        raise SlaveError(f"the model writes to the file {target}")
+    return descriptor, os.lseek(descriptor, 0, os.SEEK_CUR)
 
 
 def reopen(readers: list[Reader]) -> None:

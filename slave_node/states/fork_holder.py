@@ -15,15 +15,16 @@ import socket
 from pathlib import Path
 from typing import NoReturn
 
-from protocol.calls import Configure, Describe
-from protocol.codec import decode_map, decode_program, encode_error, encode_program, encode_reply
+from protocol.calls import Configure, Reply
+from protocol.codec import decode_map, decode_program, encode_error, encode_reply
 from protocol.errors import DoublestepError, SlaveError
-from protocol.slave import CallExecutor
+from protocol.slave import CallExecutor, Slave
 from slave_node.executor import Executor
 from slave_node.loading import load_model
 from slave_node.states.channel import PROCESS, Channel, Message
 from slave_node.states.fork_hindrances import ForkHindrances, reopen
 from slave_node.states.fork_keeper import report
+from slave_node.states.step_message import execute_step
 
 _CHILD = frozenset({signal.SIGCHLD})
 
@@ -40,23 +41,23 @@ def hold(connection: socket.socket, obituaries: int) -> NoReturn:
     hindrances = ForkHindrances()
     try:
         _, what = channel.receive()
-        executor = _load(what)
+        slave = _load(what)
     except DoublestepError as error:
         channel.send(Message.DONE, encode_error(error))
         os._exit(0)
     except (EOFError, OSError):
         os._exit(0)
-    channel.send(Message.DONE, _execute(executor, encode_program([Describe()])))
+    channel.send(Message.DONE, encode_reply(Reply([slave.description], None, 0.0)))
     gc.collect()
     gc.freeze()  # what is loaded is not looked at again: its pages stay shared
-    _Holder(channel, executor, hindrances, obituaries).serve()
+    _Holder(channel, slave, hindrances, obituaries).serve()
 
 
-def _load(message: bytes) -> CallExecutor:
+def _load(message: bytes) -> Slave:
     what = decode_map(message)
     configuration = decode_program(bytes(what["configuration"]))[0]  # type: ignore[arg-type]
     assert isinstance(configuration, Configure)
-    slave = load_model(
+    return load_model(
         str(what["model"]),
         Path(str(what["base"])),
         str(what["name"]),
@@ -64,7 +65,6 @@ def _load(message: bytes) -> CallExecutor:
         log_all=bool(what["log_all"]),
         configuration=configuration,
     )
-    return Executor(slave)
 
 
 def _execute(executor: CallExecutor, program: bytes) -> bytes:
@@ -84,12 +84,13 @@ class _Holder:
     def __init__(
         self,
         channel: Channel,
-        executor: CallExecutor,
+        slave: Slave,
         hindrances: ForkHindrances,
         obituaries: int,
     ) -> None:
         self._channel = channel
-        self._executor = executor
+        self._slave = slave
+        self._executor = Executor(slave)
         self._hindrances = hindrances
         self._obituaries = obituaries
         self._children: set[int] = set()
@@ -103,6 +104,8 @@ class _Holder:
             while True:
                 kind, payload = self._next()
                 match kind:
+                    case Message.STEP:
+                        self._step(payload)
                     case Message.PROGRAM:
                         self._channel.send(Message.DONE, _execute(self._executor, payload))
                     case Message.FORK:
@@ -114,21 +117,26 @@ class _Holder:
             self._flush(None)
             os._exit(0)
 
-    def _next(self) -> tuple[int, bytes]:
+    def _next(self) -> tuple[Message, bytes]:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _CHILD)
         try:
             return self._channel.receive()
         finally:
             signal.pthread_sigmask(signal.SIG_BLOCK, _CHILD)
 
+    def _step(self, payload: bytes) -> None:
+        try:
+            answer = execute_step(self._slave, payload)
+        except DoublestepError as error:
+            self._channel.send(Message.REFUSED, encode_error(error))
+        else:
+            self._channel.send(Message.DONE, answer)
+
     def _fork(self, connection: socket.socket) -> None:
         """Make a copy that serves ``connection``."""
         ours = {self._channel.fileno(), connection.fileno()}
         try:
-            hindrance = self._hindrances.find(ours)
-            if hindrance:
-                raise SlaveError(hindrance)
-            readers = self._hindrances.readers(ours)
+            readers = self._hindrances.check(ours)
             self._flush(None)  # what the model has printed is not to be printed by both
             child = os.fork()
         except (OSError, SlaveError) as error:

@@ -15,6 +15,7 @@ import os
 import signal
 import socket
 import sys
+from contextlib import suppress
 from struct import Struct
 
 OBITUARY = Struct("<qq")
@@ -65,10 +66,8 @@ def _hold(channel: int, obituaries: int) -> None:
 def report(obituaries: int, pid: int, status: int) -> None:
     """Write down how a process died, unless it ended as it should."""
     if status:
-        try:
+        with suppress(OSError):  # nobody reads them any more
             os.write(obituaries, OBITUARY.pack(pid, status))
-        except OSError:
-            pass  # nobody reads them any more
 
 
 def _bury(obituaries: int) -> None:

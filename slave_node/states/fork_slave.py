@@ -10,7 +10,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 
@@ -31,15 +31,17 @@ from protocol.calls import (
 )
 from protocol.codec import decode_reply, encode_map, encode_program
 from protocol.errors import (
+    DoublestepError,
     FatalSlaveError,
     SlaveCrashedError,
     SlaveError,
     StepRejectedError,
 )
 from protocol.signals import FloatArray
-from protocol.slave import Slave, SlaveDescription, StartValue, StateKind, StepStatus
+from protocol.slave import Slave, SlaveDescription, StartValue, StateKind
 from slave_node.states.channel import PROCESS, Channel, Message
 from slave_node.states.fork_family import HolderFamily
+from slave_node.states.step_message import decode_stepped, encode_step
 
 _CLOSE_TIME = 0.5
 
@@ -53,7 +55,7 @@ class HeldModel:
     name: str
     scratch: Path
     log_all: bool = False
-    configuration: Configure = Configure()
+    configuration: Configure = field(default_factory=Configure)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +113,8 @@ class ForkSlave(Slave):
                 "configuration": encode_program([model.configuration]),
             }
         )
-        reply = decode_reply([Describe()], self._ask(Message.LOAD, message))
+        _, answer = self._ask(Message.LOAD, message)
+        reply = decode_reply([Describe()], answer)
         if reply.error is not None:
             raise reply.error
         (description,) = reply.results
@@ -122,7 +125,6 @@ class ForkSlave(Slave):
         """Nothing is under way: no inputs wait for a step, no outputs were brought back."""
         self._pending: list[Call] = []
         self._order: int | None = None
-        self._reads_discrete = False
         self._outputs: FloatArray | None = None
         self._discrete_outputs: tuple[StartValue, ...] | None = None
 
@@ -136,7 +138,7 @@ class ForkSlave(Slave):
             )
         return self._active
 
-    def _ask(self, kind: Message, payload: bytes) -> bytes:
+    def _ask(self, kind: Message, payload: bytes) -> tuple[Message, bytes]:
         """What the holder answers.
 
         Raises:
@@ -145,11 +147,19 @@ class ForkSlave(Slave):
         holder = self._holder()
         try:
             holder.channel.send(kind, payload)
-            return holder.channel.receive()[1]
+            return holder.channel.receive()
         except (EOFError, OSError):
-            self._active = None
-            holder.channel.close()
+            self._drop_active()
             raise self._died(holder) from None
+        except BaseException:  # Ctrl-C: what it answers would be for nobody
+            self._drop_active()
+            raise
+
+    def _drop_active(self) -> None:
+        """Let the process that is the slave end, unless it has already."""
+        if self._active is not None:
+            self._active.channel.close()
+            self._active = None
 
     def _died(self, holder: _Holder) -> SlaveCrashedError:
         return SlaveCrashedError(
@@ -165,7 +175,8 @@ class ForkSlave(Slave):
         pending, self._pending = self._pending, []
         program = [*pending, *calls]
         self._outputs = self._discrete_outputs = None
-        reply = decode_reply(program, self._ask(Message.PROGRAM, encode_program(program)))
+        _, answer = self._ask(Message.PROGRAM, encode_program(program))
+        reply = decode_reply(program, answer)
         if reply.error is not None:
             raise reply.error
         return reply.results[len(pending) :]
@@ -223,28 +234,33 @@ class ForkSlave(Slave):
             StepRejectedError: also then, if there is a saved state to go back to.
             FatalSlaveError: if there is none.
         """
-        calls: list[Call] = [DoStep(communication_point, step_size, no_set_state_prior)]
-        if self._order is not None:
-            calls.append(GetOutputs(self._order))
-        if self._reads_discrete:
-            calls.append(GetDiscreteOutputs())
+        step = DoStep(communication_point, step_size, no_set_state_prior)
         try:
-            result, *outputs = self._run(*calls)
+            return self._step(step)
         except (SlaveCrashedError, FatalSlaveError) as error:
             raise self._fallen(error) from None
-        assert isinstance(result, StepResult)
-        if result.status is StepStatus.OK:
-            if self._order is not None:
-                self._outputs = outputs[0]  # type: ignore[assignment]
-            if self._reads_discrete:
-                self._discrete_outputs = outputs[-1]  # type: ignore[assignment]
+
+    def _step(self, step: DoStep) -> StepResult:
+        """Take it, after the inputs that were put off, and bring back outputs."""
+        self._outputs = self._discrete_outputs = None
+        inputs: FloatArray | None = None
+        match self._pending:
+            case []:
+                pass
+            case [SetInputs(derivatives=inputs)]:
+                self._pending = []
+            case _:
+                self._run()
+        order = self._order
+        kind, answer = self._ask(Message.STEP, encode_step(inputs, step, order))
+        if kind is not Message.DONE:
+            raise _refusal(answer)
+        result, self._outputs = decode_stepped(answer, order)
         return result
 
     def _fallen(self, error: SlaveError) -> SlaveError:
         """What a step that ended the model means for the caller."""
-        if self._active is not None:  # it must not be called any more
-            self._active.channel.close()
-            self._active = None
+        self._drop_active()  # it must not be called any more
         kind = StepRejectedError if self._saved else FatalSlaveError
         return kind(error.cause, remedy=error.remedy)
 
@@ -259,7 +275,6 @@ class ForkSlave(Slave):
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """See `Slave`."""
         if self._discrete_outputs is None:
-            self._reads_discrete = True
             self._discrete_outputs, *_ = self._run(GetDiscreteOutputs())  # type: ignore[assignment]
         assert self._discrete_outputs is not None
         return self._discrete_outputs
@@ -288,9 +303,7 @@ class ForkSlave(Slave):
 
     def _end(self) -> None:
         self._free_all()
-        if self._active is not None:
-            self._active.channel.close()
-            self._active = None
+        self._drop_active()
         self._family.close()
 
     # ---- Saved states -------------------------------------------------------------------------
@@ -323,13 +336,13 @@ class ForkSlave(Slave):
         self._saved.discard(holder)
         holder.channel.close()
 
-    def serialize_state(self, state: object) -> bytes:
+    def serialize_state(self, state: object) -> bytes:  # noqa: ARG002
         """See `Slave`: a process cannot be put into bytes."""
-        raise SlaveError(f"{self.description.model}: a state saved by forking cannot be serialized")
+        raise SlaveError(f"a saved state of {self.description.model} is a process, not bytes")
 
-    def deserialize_state(self, data: bytes) -> object:
+    def deserialize_state(self, data: bytes) -> object:  # noqa: ARG002
         """See `serialize_state`."""
-        raise SlaveError(f"{self.description.model}: a state saved by forking cannot be serialized")
+        raise SlaveError(f"a saved state of {self.description.model} is a process, not bytes")
 
     def _state(self, state: object) -> _Holder:
         if not isinstance(state, _Holder) or state not in self._saved:
@@ -352,18 +365,15 @@ class ForkSlave(Slave):
             except (EOFError, OSError):
                 ours.close()
                 if holder is self._active:
-                    self._active = None
+                    self._drop_active()
                 raise self._died(holder) from None
-        if kind != Message.DONE:
+        if kind is not Message.DONE:
             ours.close()
-            error = decode_reply([], answer).error
-            assert error is not None
-            raise error
+            raise _refusal(answer)
         return _Holder(self._family.channel(ours), *PROCESS.unpack(answer))
 
     def _go_on_with(self, holder: _Holder) -> None:
-        if self._active is not None:
-            self._active.channel.close()
+        self._drop_active()
         self._active = holder
         self._pending = []
         self._outputs = self._discrete_outputs = None
@@ -372,3 +382,10 @@ class ForkSlave(Slave):
         for holder in self._saved:
             holder.channel.close()
         self._saved.clear()
+
+
+def _refusal(answer: bytes) -> DoublestepError:
+    """The error in an answer that is not `Message.DONE`."""
+    error = decode_reply([], answer).error
+    assert error is not None
+    return error

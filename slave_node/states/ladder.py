@@ -53,9 +53,8 @@ def choose(
         case StateKind.FORK | StateKind.REPLAY | StateKind.NONE:
             reason = "the configuration asks for it" + ("" if is_native else f"; {lack}")
             return StateChoice(StateKind(wanted), reason)
-    raise ModelError(
-        f"no state can be saved by {wanted!r:.60}{nearest(wanted, [kind.value for kind in StateKind])}"
-    )
+    known = nearest(wanted, [kind.value for kind in StateKind])
+    raise ModelError(f"no state can be saved by {wanted!r:.60}{known}")
 
 
 def _best(*, is_native: bool, can_fork: bool, lack: str) -> StateChoice:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 from protocol.calls import (
     Call,
@@ -25,9 +26,11 @@ from protocol.calls import (
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
 from protocol.slave import Slave, StartValue, StateKind, StepStatus
+from slave_node.executor import Executor
 from slave_node.states.call_record import CallRecord
 
 REMARK = "a restored state is computed anew from the start time: its cost grows with the time"
+_CALLS_AT_ONCE = 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,19 +80,30 @@ class ReplaySlave(Slave):
         early_return: bool = False,
     ) -> None:
         """See `Slave`."""
-        call = Initialize(
-            start_time,
-            stop_time,
-            relative_tolerance,
-            dict(start_values),
-            tuple(inputs),
-            tuple(outputs),
-            tuple(discrete_inputs),
-            tuple(discrete_outputs),
-            early_return,
+        self._slave.initialize(
+            start_time=start_time,
+            stop_time=stop_time,
+            relative_tolerance=relative_tolerance,
+            start_values=start_values,
+            inputs=inputs,
+            outputs=outputs,
+            discrete_inputs=discrete_inputs,
+            discrete_outputs=discrete_outputs,
+            early_return=early_return,
         )
-        self._execute(call)
-        self._record = CallRecord(call)
+        self._record = CallRecord(
+            Initialize(
+                start_time,
+                stop_time,
+                relative_tolerance,
+                dict(start_values),
+                tuple(inputs),
+                tuple(outputs),
+                tuple(discrete_inputs),
+                tuple(discrete_outputs),
+                early_return,
+            )
+        )
 
     def exit_initialization_mode(self) -> None:
         """See `Slave`."""
@@ -143,13 +157,15 @@ class ReplaySlave(Slave):
             raise SlaveError("no such state is saved")
         record = state.record.copy(state.length)
         self._restart()
-        for call in record.calls():
-            try:
-                result = self._execute(call)
-            except SlaveError as error:
-                raise _did_not_repeat(call, error.cause) from error
-            if isinstance(result, StepResult) and result.status is not StepStatus.OK:
-                raise _did_not_repeat(call, str(result.status))
+        executor = Executor(self._slave)
+        calls = record.calls()
+        while some := list(islice(calls, _CALLS_AT_ONCE)):
+            results, error, _ = executor.execute(some)
+            if error is not None:
+                raise _did_not_repeat(some[len(results)], error.cause)
+            last = results[-1]
+            if isinstance(last, StepResult) and last.status is not StepStatus.OK:
+                raise _did_not_repeat(some[len(results) - 1], str(last.status))
         self._record = record
 
     def free_state(self, state: object) -> None:
@@ -173,38 +189,6 @@ class ReplaySlave(Slave):
         except SlaveError:
             self._slave.close()
             self._slave = self._load()
-
-    def _execute(self, call: Call) -> object:
-        """Do a recorded call."""
-        slave = self._slave
-        match call:
-            case Initialize():
-                return slave.initialize(
-                    start_time=call.start_time,
-                    stop_time=call.stop_time,
-                    relative_tolerance=call.relative_tolerance,
-                    start_values=call.start_values,
-                    inputs=call.inputs,
-                    outputs=call.outputs,
-                    discrete_inputs=call.discrete_inputs,
-                    discrete_outputs=call.discrete_outputs,
-                    early_return=call.early_return,
-                )
-            case SetInputs():
-                return slave.set_inputs(call.derivatives)
-            case DoStep():
-                return slave.do_step(
-                    call.communication_point, call.step_size, call.no_set_state_prior
-                )
-            case GetOutputs():
-                return slave.get_outputs(call.order)
-            case SetDiscreteInputs():
-                return slave.set_discrete_inputs(call.values)
-            case GetDiscreteOutputs():
-                return slave.get_discrete_outputs()
-            case ExitInitializationMode():
-                return slave.exit_initialization_mode()
-        raise AssertionError(call)
 
     # ---- Ends ---------------------------------------------------------------------------------
 

@@ -87,19 +87,19 @@ class StatelessSlave(Slave):
         """Raises `SlaveError`, as all that is about saved states."""
         self._refuse()
 
-    def set_state(self, state: object) -> None:
+    def set_state(self, state: object) -> None:  # noqa: ARG002
         """See `get_state`."""
         self._refuse()
 
-    def free_state(self, state: object) -> None:
+    def free_state(self, state: object) -> None:  # noqa: ARG002
         """See `get_state`."""
         self._refuse()
 
-    def serialize_state(self, state: object) -> bytes:
+    def serialize_state(self, state: object) -> bytes:  # noqa: ARG002
         """See `get_state`."""
         self._refuse()
 
-    def deserialize_state(self, data: bytes) -> object:
+    def deserialize_state(self, data: bytes) -> object:  # noqa: ARG002
         """See `get_state`."""
         self._refuse()
 
