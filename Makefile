@@ -38,4 +38,4 @@ $(STAMP): pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo_results results examples/*/*.fmu
+	rm -rf $(VENV) demo_results results examples/*/*.fmu examples/*/*.ssp

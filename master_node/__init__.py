@@ -3,6 +3,7 @@
 from master_node.configuration import (
     BusSettings,
     Connection,
+    InputSettings,
     SimulationSettings,
     SlaveSettings,
     System,
@@ -10,14 +11,17 @@ from master_node.configuration import (
 )
 from master_node.results import Result
 from master_node.simulation import simulate
+from master_node.system_files import open_system
 
 __all__ = [
     "BusSettings",
     "Connection",
+    "InputSettings",
     "Result",
     "SimulationSettings",
     "SlaveSettings",
     "System",
     "load_system",
+    "open_system",
     "simulate",
 ]

@@ -6,7 +6,7 @@ import logging
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -22,12 +22,16 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+log = logging.getLogger("master_node")
+
 ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
 
 
 @app.command()
 def run(  # noqa: PLR0917  options of the command line
-    system_file: Annotated[Path, typer.Argument(metavar="SYSTEM.toml", help="What to run.")],
+    system_file: Annotated[
+        Path, typer.Argument(metavar="SYSTEM", help="What to run: a .toml, .ssp or .ssd file.")
+    ],
     output: Annotated[Path, typer.Option(help="Directory for the results.")] = Path("results"),
     preset: Annotated[
         str | None, typer.Option(help="paper: the method as Schierz, Arnold and Clauß have it.")
@@ -86,18 +90,18 @@ def run(  # noqa: PLR0917  options of the command line
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
 ) -> None:
-    """Run SYSTEM.toml and write results.csv, steps.csv, summary.json and results.png."""
-    with _interruptible():
+    """Run SYSTEM and write results.csv, steps.csv, summary.json and results.png."""
+    with _interruptible(), ExitStack() as stack:
         from rich.console import Console  # noqa: PLC0415  each command imports what it needs
 
-        from master_node.configuration import load_system  # noqa: PLC0415
         from master_node.plots import plot_result  # noqa: PLC0415
         from master_node.progress import ProgressBar, summary_table  # noqa: PLC0415
         from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
         from master_node.simulation import run as run_system  # noqa: PLC0415
+        from master_node.system_files import open_system  # noqa: PLC0415
 
         system = (
-            load_system(system_file)
+            stack.enter_context(open_system(system_file))
             .with_simulation(
                 preset=preset,
                 order=_order(order),
@@ -179,6 +183,41 @@ def compare(
     Console().print(comparison.table())
     if not comparison.within_tolerance:
         raise typer.Exit(1)
+
+
+@app.command("import")
+def import_(
+    package: Annotated[
+        Path, typer.Argument(metavar="SYSTEM.ssp", help="A package, or an .ssd file.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="System file [default: SYSTEM.toml].")
+    ] = None,
+) -> None:
+    """Write an SSP as SYSTEM.toml, with its FMUs in a folder SYSTEM_models beside it."""
+    from master_node.system_files import import_system  # noqa: PLC0415
+
+    path = output or package.with_suffix(".toml")
+    for note in import_system(package, path):
+        log.warning("%s", note)
+    typer.echo(path)
+
+
+@app.command()
+def export(
+    system_file: Annotated[
+        Path, typer.Argument(metavar="SYSTEM.toml", help="A system whose slaves are FMUs.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Package [default: SYSTEM.ssp].")
+    ] = None,
+) -> None:
+    """Write a system and its FMUs as an SSP 1.0 package."""
+    from master_node.system_files import export_system  # noqa: PLC0415
+
+    path = output or system_file.with_suffix(".ssp")
+    export_system(system_file, path)
+    typer.echo(path)
 
 
 def _order(text: str | None) -> int | str | None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from master_node.configuration import System
 from master_node.controlled_run import ControlledRun
-from master_node.coupling_scheme import CouplingScheme, largest_order, outputs_follow_inputs
+from master_node.coupling_scheme import CouplingScheme, outputs_follow_inputs
 from master_node.fixed_run import FixedRun
 from master_node.initialization import initialize
 from master_node.numerics.error_estimators import ESTIMATORS
@@ -52,11 +52,16 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
                 remedy=f"give [slaves.{part.name}] step_size, or use --estimator none with a fixed "
                 "--step-size",
             )
-        highest, wanted = largest_order(part), settings.order
-        if part.inputs and (highest < (1 if wanted == "auto" else wanted)):
+        highest, wanted = part.max_order, settings.order
+        if part.connected and (highest < (1 if wanted == "auto" else wanted)):
             warnings.append(
                 f"{part.name} cannot interpolate inputs (canInterpolateInputs): its inputs are "
                 f"held constant in each step, order {highest} instead of {wanted}"
+            )
+        if any(coupled.external.changes[part.external_slice]) and not highest:
+            warnings.append(
+                f"{part.name} cannot interpolate inputs (canInterpolateInputs): its external "
+                "inputs are held at their mean in each step"
             )
         has_feed_through = coupled.feed_through[part.output_slice].any()
         evaluates = settings.evaluate_outputs and has_feed_through
@@ -67,7 +72,26 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
                 f"without a step; if they do, say so: [slaves.{part.name}] "
                 "outputs_follow_inputs = true"
             )
-    return warnings
+    return warnings + _jumps_off_the_grid(coupled, system)
+
+
+def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:
+    """Without an estimator no communication point is put where an external input jumps."""
+    settings = system.simulation
+    if settings.estimator != "none":
+        return []
+    start, stop, step_size = float(settings.start_time), settings.end, settings.step_size
+    inside = [jump for jump in coupled.external.jumps if start < jump.time < stop]
+    steps = np.array([(jump.time - start) / step_size for jump in inside])
+    is_off = np.abs(steps - np.round(steps)) > 1e-9 * np.maximum(1.0, steps)
+    if not is_off.any():
+        return []
+    first = inside[int(np.argmax(is_off))]
+    return [
+        f"{int(is_off.sum())} jumps of external inputs are not at communication points, the first "
+        f"one is that of {first.name} at t={first.time!r} s: in a step over a jump the polynomial "
+        "has the right mean only; choose a step size that meets them, or an estimator"
+    ]
 
 
 @dataclass
@@ -97,7 +121,7 @@ class CoSimulation:
         """
         settings = self.system.simulation
         scheme = CouplingScheme.of(self.coupled, self.system)
-        y = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
+        y = initialize(self.group, self.coupled, self.system, scheme.get_outputs).y
         self.group.restart_statistics()
         statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
         self.observer.started(

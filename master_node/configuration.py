@@ -7,20 +7,25 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     StrictBool,
     StrictFloat,
     StrictInt,
     StrictStr,
+    Tag,
     ValidationError,
+    field_serializer,
     field_validator,
     model_validator,
 )
@@ -51,7 +56,9 @@ Number = Annotated[StrictFloat, AfterValidator(_finite)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Reference = Annotated[StrictStr, AfterValidator(_reference)]
-Value = StrictBool | StrictInt | StrictFloat | StrictStr
+Scalar = StrictBool | StrictInt | StrictFloat | StrictStr
+Value = Scalar | tuple[Scalar, ...] | tuple[tuple[Scalar, ...], ...]
+"""A value, or those of an array with one or two dimensions."""
 
 
 class _Table(BaseModel):
@@ -301,12 +308,20 @@ class SlaveSettings(_Table):
 
 
 class Connection(_Table):
-    """A ``[[connections]]`` table: ``from = "slave.output"``, ``to = "slave.input"``."""
+    """A ``[[connections]]`` table: ``from = "slave.output"``, ``to = "slave.input"``.
+
+    Attributes:
+        factor, offset: input = factor * output + offset, in place of a conversion of units.
+        ignore_units: hand the value on as it is, whatever the units.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     source: Reference = Field(alias="from")
     target: Reference = Field(alias="to")
+    factor: Number | None = None
+    offset: Number | None = None
+    ignore_units: StrictBool = False
 
     @model_validator(mode="before")
     @classmethod
@@ -314,6 +329,116 @@ class Connection(_Table):
         if isinstance(value, tuple) and len(value) == 2:
             return {"from": value[0], "to": value[1]}
         return value
+
+
+class InputRows:
+    """A table of an input as arrays.
+
+    Attributes:
+        times: [s].
+        values: at these times, of the same shape (n,).
+    """
+
+    def __init__(self, times: Any, values: Any) -> None:
+        try:
+            self.times = np.array(times, dtype=float)
+            self.values = np.array(values, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError("write two arrays of numbers, times and values") from None
+        if self.times.ndim != 1 or self.times.shape != self.values.shape:
+            raise ValueError(
+                f"times of shape {self.times.shape} and values of shape {self.values.shape} are "
+                "not two rows of the same length"
+            )
+
+    def __str__(self) -> str:
+        return f"{len(self.times)} rows"
+
+
+class InputSettings(_Table):
+    """What drives an input in ``[inputs]`` unless it is a constant: a table or a function.
+
+    Attributes:
+        table: a file ``.csv``, ``.npy`` or ``.npz``, relative to the system file; in Python also
+            times and values, two arrays.
+        column: of the values; needed where a table has more than one beside the times.
+        time: column of the times [s]; default: the first one.
+        interpolation: between the rows.
+        extrapolate: what holds where the rows do not cover the simulated time; default: an error.
+        function: ``package.module:name`` or ``file.py:name``, relative to the system file, of the
+            time [s]; in Python also the function itself.
+        breakpoints: times at which the function jumps or has a kink [s].
+        order: highest degree of the polynomials that stand for the function.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    table: StrictStr | InputRows | None = None
+    column: StrictStr | None = None
+    time: StrictStr | None = None
+    interpolation: Literal["linear", "hold", "spline"] = "linear"
+    extrapolate: Literal["hold"] | None = None
+    function: StrictStr | Callable[[float], float] | None = None
+    breakpoints: tuple[Number, ...] = ()
+    order: Literal[0, 1, 2, 3] = 3
+
+    @field_validator("table", mode="before")
+    @classmethod
+    def _rows(cls, value: Any) -> Any:
+        if isinstance(value, tuple | list) and len(value) == 2:
+            return InputRows(*value)
+        return value
+
+    @field_validator("order", mode="before")
+    @classmethod
+    def _whole_number(cls, value: Any) -> Any:
+        if isinstance(value, bool):
+            raise ValueError("must be a whole number")  # noqa: TRY004  pydantic wants ValueError
+        return value
+
+    @field_serializer("table", "function")
+    def _in_words(self, value: Any) -> str | None:
+        """For ``summary.json``: files and functions by name."""
+        if callable(value):
+            module = getattr(value, "__module__", None) or type(value).__module__
+            return f"{module}:{getattr(value, '__qualname__', type(value).__qualname__)}"
+        return None if value is None else str(value)
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if (self.table is None) == (self.function is None):
+            raise ValueError("give either table or function")
+        given = self.model_fields_set
+        of_tables = {"column", "time", "interpolation", "extrapolate"}
+        of_functions = {"breakpoints", "order"}
+        is_table = self.table is not None
+        for key in sorted(given & (of_functions if is_table else of_tables)):
+            kinds = ("functions", "table") if is_table else ("tables", "function")
+            raise ValueError(f"{key} is for {kinds[0]}, and this is a {kinds[1]}")
+        return self
+
+
+def _kind_of_input(value: Any) -> str:
+    return "input-value" if isinstance(value, bool | int | float | str) else "input-settings"
+
+
+def _as_settings(value: Any) -> Any:
+    """A function or two arrays, given in Python, as a table of settings."""
+    if callable(value):
+        return {"function": value}
+    return {"table": value} if isinstance(value, tuple) else value
+
+
+def _finite_value(value: Value) -> Value:
+    return _finite(value) if isinstance(value, float) else value
+
+
+InputValue = Annotated[
+    Annotated[Scalar, AfterValidator(_finite_value), Tag("input-value")]
+    | Annotated[InputSettings, BeforeValidator(_as_settings), Tag("input-settings")],
+    Discriminator(_kind_of_input),
+]
+"""A constant, or a signal over time."""
 
 
 class BusSettings(_Table):
@@ -343,6 +468,8 @@ class System(_Table):
     """A whole system: what a system file holds.
 
     Attributes:
+        inputs: what drives inputs from outside, by ``slave.variable``; in Python also functions of
+            the time, and tuples of times and values.
         base: directory to which the models' paths are relative.
         source: what to call this in messages: the file's name.
     """
@@ -350,6 +477,7 @@ class System(_Table):
     simulation: SimulationSettings = SimulationSettings()
     slaves: Mapping[str, SlaveSettings]
     connections: tuple[Connection, ...] = ()
+    inputs: Mapping[Reference, InputValue] = Field(default_factory=dict)
     bus: BusSettings = BusSettings()
     base: Path = Field(default_factory=Path.cwd, exclude=True)
     source: str = Field(default="the system", exclude=True)
@@ -411,7 +539,7 @@ class System(_Table):
         return self._with(bus=self.bus.model_dump(exclude_unset=True) | given)
 
     def _with(self, **tables: Any) -> System:
-        kept = {"simulation", "slaves", "connections", "bus"} - tables.keys()
+        kept = {"simulation", "slaves", "connections", "inputs", "bus"} - tables.keys()
         return System(
             **{name: getattr(self, name) for name in kept},
             **tables,
@@ -462,7 +590,7 @@ def _sentence(detail: ErrorDetails) -> str:
     message = _WORDS.get(kind, detail["msg"].removeprefix("Value error, "))
     message = message[:1].lower() + message[1:]
     if len(place) > 2 and place[2] == "parameters":
-        message = "must be a number, a boolean or a string"
+        message = "must be a number, a boolean, a string or an array of them"
     if not place:
         return message
     if kind == "value_error" and len(place) == 1:
@@ -476,7 +604,12 @@ _WORDS = {
     "mapping_type": "must be a table",
     "tuple_type": "must be an array",
 }
-_UNION_BRANCHES = frozenset({"float", "int", "bool", "str", "constrained-float", "constrained-int"})
+_UNION_BRANCHES = frozenset(
+    {
+        *("float", "int", "bool", "str", "constrained-float", "constrained-int"),
+        *("input-value", "input-settings", "is-instance[InputRows]", "callable"),
+    }
+)
 
 
 def _table(place: list[str]) -> str:
@@ -500,5 +633,7 @@ def _known_keys(place: list[str]) -> list[str]:
         case ["slaves", _, "tolerances", _]:
             model = OutputTolerance
         case ["connections", _]:
-            return ["from", "to"]
+            return [field.alias or name for name, field in Connection.model_fields.items()]
+        case ["inputs", _]:
+            model = InputSettings
     return [name for name in model.model_fields if name not in ("base", "source")]

@@ -23,6 +23,7 @@ from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials
 from master_node.numerics.initial_step_size import initial_step_size, trial_step_size
+from master_node.numerics.landing_points import LandingPoints
 from master_node.numerics.order_control import DEPTH, OrderMemory
 from master_node.numerics.step_size_controller import (
     EXPONENTS,
@@ -35,7 +36,7 @@ from master_node.order_selection import OrderSelection
 from master_node.result_points import Reached, ResultPoints, count_accepted
 from master_node.run_context import RunContext
 from master_node.step_requests import FailedStep
-from master_node.step_size_rules import step_size_limits
+from master_node.step_size_rules import crossings, step_size_limits
 from protocol.errors import DoublestepError, StepSizeError
 from protocol.signals import FloatArray
 from protocol.slave import StepStatus
@@ -88,12 +89,17 @@ class ControlledRun:
         settings, coupled, scheme = context.system.simulation, context.coupled, context.scheme
         self._settings = settings
         self._start = float(settings.start_time)
-        self._source = coupled.source
+        self._coupled = coupled
         self._scheme = scheme
         self._observer = context.observer
         self._statistics = context.statistics
         self._estimator = estimator
         self._limits = step_size_limits(context.system)
+        external = coupled.external
+        self._crossings = crossings(context.system, self._limits, external.jumps)
+        # Where H is a multiple of something a double step cannot end wherever a kink is.
+        kinks = external.kinks if self._limits.quantum is None else ()
+        self._landing_points = LandingPoints(kinks, self._limits.smallest)
         self._stepper = DoubleStepper(context.group, coupled, scheme, estimator)
         self._control = ErrorControl(coupled, scheme, estimator, settings.constants)
         self._defects = InputDefects(coupled, scheme, self._control)
@@ -132,30 +138,29 @@ class ControlledRun:
             self._settings.output_grid, self._scheme.has_derivative, self._start, y
         )
         position = self._first_position(y)
-        for target, event in self._targets():
+        for target, crossing in self._targets():
             while position.time < target:
                 following = self._advance(position, target)
                 if isinstance(following, str):
                     return following
                 position = following
-            if event is not None:
-                following = self._cross(position, event)
+            if crossing is not None:
+                following = self._cross(position, *crossing)
                 if isinstance(following, str):
                     return following
                 position = following
         return ""
 
-    def _targets(self) -> Iterator[tuple[float, DoubleStepTimes | None]]:
-        """Where double steps must end: before each declared event, and at the stop time."""
-        for event in sorted(set(map(float, self._settings.events))):
-            crossing = self._limits.crossing(self._start, event)
-            yield crossing.begin, crossing
+    def _targets(self) -> Iterator[tuple[float, tuple[DoubleStepTimes, str] | None]]:
+        """Where double steps must end: before each known event, and at the stop time."""
+        for crossing in self._crossings:
+            yield crossing[0].begin, crossing
         yield self._settings.end, None
 
     # --- beginnings -----------------------------------------------------------------------------
 
     def _first_position(self, y: FloatArray) -> _Position:
-        settings, u = self._settings, y[:, self._source]
+        settings, u = self._settings, self._coupled.inputs_of(y)
         points = settings.polynomial.order + 1  # an input without a derivative needs them all
         depth = self._estimator.points(points) + self._scheme.known_ahead
         depth = max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
@@ -214,6 +219,9 @@ class ControlledRun:
         wanted = step_within(
             position.bracket, position.time, position.step_size, self._limits.smallest
         )
+        target = self._landing_points.target(
+            position.time, wanted, target, first=position.controller.rejected
+        )
         times = self._limits.times(self._start, position.time, wanted, target)
         polynomials = self._polynomials(position)
         step = self._stepper.attempt(position.history, times, polynomials)
@@ -231,7 +239,8 @@ class ControlledRun:
             or does_not_shrink(position.bracket, times.first, defects)
         )
         if jumps and self._is_smallest(times):
-            return self._accept_jump(position, step, error, self._defects.name(defects))
+            name = f"{self._defects.name(defects)} jumps"
+            return self._accept_jump(position, step, error, name)
         if error.norm <= 1.0 and not jumps:
             return self._accept(position, step, error, defects)
         return self._reject(position, step, error, defects)
@@ -241,7 +250,7 @@ class ControlledRun:
     ) -> _Position:
         self._stepper.accepted()
         times, polynomials = step.times, step.polynomials
-        history = step.history.pushed(times.end, step.end.take(self._source, axis=1))
+        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
         reached: Reached = ((times.middle, step.middle), (times.end, step.end))
         order = max(polynomial.order for polynomial in polynomials)
         self._tell_accepted(step, error, reached, self._results.reached(reached, order))
@@ -291,6 +300,9 @@ class ControlledRun:
         _, following, controller = self._controller.decide(
             times.first, error.norm, self._control.exponent(step.polynomials), position.controller
         )
+        kink = self._landing_points.inside(times)
+        if kink is not None:  # the double step up to there is smooth
+            following = max(following, (kink - times.begin) / 2.0)
         if defects is None:
             return replace(position, step_size=following, controller=controller)
         is_search = bracket.end is not None or not is_noticed
@@ -346,8 +358,8 @@ class ControlledRun:
 
     # --- discontinuities ------------------------------------------------------------------------
 
-    def _cross(self, position: _Position, times: DoubleStepTimes) -> _Position | str:
-        """The double step over a declared event, whatever its error is."""
+    def _cross(self, position: _Position, times: DoubleStepTimes, name: str) -> _Position | str:
+        """The double step over a known event, whatever its error is."""
         polynomials = self._polynomials(position)
         step = self._stepper.attempt(position.history, times, polynomials)
         if isinstance(step, FailedStep):
@@ -357,7 +369,7 @@ class ControlledRun:
         error = self._control.judge(step)
         if not error.norm < _INF:
             raise self._stuck(error, times)
-        return self._accept_jump(position, step, error, "event")
+        return self._accept_jump(position, step, error, name)
 
     def _accept_jump(
         self, position: _Position, step: DoubleStep, error: StepError, name: str
@@ -370,9 +382,9 @@ class ControlledRun:
         self._statistics.double_steps_at_discontinuities += 1
         times = step.times
         reached: Reached = ((times.middle, step.middle), (times.end, step.end))
-        error = error._replace(limiting_variable=name if name == "event" else f"{name} jumps")
+        error = error._replace(limiting_variable=name)
         self._tell_accepted(step, error, reached, self._results.jumped(reached))
-        history = step.history.pushed(times.end, step.end.take(self._source, axis=1)).cut()
+        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end)).cut()
         behind = _Position(history, step.end, position.step_size, self._restarted_order())
         if times.end >= self._settings.end:
             return behind

@@ -16,8 +16,6 @@ from master_node.configuration import System
 from master_node.numerics.extrapolation import Extrapolation, InputKind
 from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import GetOutputs
-from protocol.signals import MAX_ORDER
-from protocol.slave import InputDerivatives
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class CouplingScheme:
             for part in coupled.parts
         ]
         reads_derivative = np.array(derivative_orders, dtype=bool)[coupled.output_slave]
-        has_derivative = reads_derivative & ~coupled.feed_through
+        has_derivative = reads_derivative & ~coupled.feed_through & ~coupled.held_feed_through
         group_of_slave = {slave: i for i, group in enumerate(groups) for slave in group}
         kinds: list[InputKind] = []
         kind_of_input = []
@@ -85,7 +83,7 @@ class CouplingScheme:
                 feeding = int(coupled.output_slave[source])
                 ahead = group_of_slave[feeding] < group_of_slave[target]
                 kind = InputKind(
-                    max_order=min(largest_order(part), wanted.order),
+                    max_order=min(part.max_order, wanted.order),
                     has_derivative=bool(has_derivative[source]) and not ahead,
                     ahead=ahead,
                 )
@@ -97,7 +95,7 @@ class CouplingScheme:
         return CouplingScheme(
             groups=groups,
             extrapolation=Extrapolation(kinds or [InputKind(0)], kind_array),
-            input_rows=tuple(largest_order(part) + 1 for part in coupled.parts),
+            input_rows=tuple(part.max_order + 1 for part in coupled.parts),
             get_outputs=tuple(GetOutputs(order) for order in derivative_orders),
             output_rows=1 + max(derivative_orders),
             input_has_derivative=np.array(
@@ -110,13 +108,9 @@ class CouplingScheme:
         )
 
 
-def largest_order(part: SlavePart) -> int:
-    """The highest degree of input polynomial that a slave follows."""
-    return 0 if part.description.input_derivatives is InputDerivatives.NONE else MAX_ORDER
-
-
 def _evaluated(coupled: CoupledSystem, system: System) -> tuple[int, ...]:
-    slaves: Sequence[int] = np.unique(coupled.output_slave[coupled.feed_through]).tolist()
+    feed_through = coupled.feed_through | coupled.held_feed_through
+    slaves: Sequence[int] = np.unique(coupled.output_slave[feed_through]).tolist()
     return tuple(slave for slave in slaves if outputs_follow_inputs(coupled.parts[slave], system))
 
 

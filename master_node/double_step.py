@@ -12,6 +12,9 @@ of slaves, when all slaves take their steps at once:
 In front of request 1 stands what the last attempt calls for: after an accepted step the state is
 saved (over the old one, which is freed with that), after a rejected one the old one is restored.
 In a Gauss-Seidel sequence each of both requests is one round trip for each slave.
+
+External inputs are known: each small step has its own polynomial of them. The comparison solution
+has the one over the whole double step, so that the estimates see what polynomials leave of them.
 """
 
 from __future__ import annotations
@@ -35,6 +38,7 @@ from master_node.step_requests import (
 )
 from master_node.system import CoupledSystem
 from protocol.calls import Call, DoStep, GetOutputs
+from protocol.errors import StepRejectedError
 from protocol.signals import FloatArray, InputSignal
 
 
@@ -79,7 +83,8 @@ class DoubleStepper:
         scheme: CouplingScheme,
         estimator: ErrorEstimator,
     ) -> None:
-        self._source = coupled.source
+        self._coupled = coupled
+        self._external = coupled.external
         self._scheme = scheme
         self._is_long_step = estimator.comparison is Comparison.LONG_STEP
         self._requests = StepRequests(group, coupled, scheme)
@@ -109,6 +114,8 @@ class DoubleStepper:
             return self._attempt(history, times, polynomials)
         except BrokenOffError as broken_off:
             return broken_off.failed
+        except StepRejectedError as error:  # of an external input, before anything was sent
+            return FailedStep("", None, float("nan"), error.cause)
 
     def accepted(self) -> None:
         """Go on from the end: the state saved at T_n is not needed any more."""
@@ -118,6 +125,9 @@ class DoubleStepper:
         self, history: CouplingHistory, times: DoubleStepTimes, polynomials: Polynomials
     ) -> DoubleStep:
         begin, middle, end, first, second = times
+        external = self._external.over(begin, middle)
+        external_second = self._external.over(middle, end)
+        external_long = self._external.over(begin, end)
         signals: dict[str, InputSignal] = {}
 
         def inputs_of(step: str, past: CouplingHistory, time: float) -> Inputs:
@@ -134,28 +144,31 @@ class DoubleStepper:
             comparison_piece = Piece(
                 None,
                 inputs_of("long", past, end),
+                external_long,
                 DoStep(begin, first + second, True),
                 *self._comparison,
             )
-            small_piece = Piece((RESTORE_POINT,), first_inputs, step, *self._solution)
+            small_piece = Piece((RESTORE_POINT,), first_inputs, external, step, *self._solution)
             comparison, y_middle = self._requests.take([comparison_piece, small_piece])
             before_second: tuple[Call, ...] = ()
         else:
             past = history
-            small_piece = Piece(None, first_inputs, step, *self._solution)
+            small_piece = Piece(None, first_inputs, external, step, *self._solution)
             comparison_piece = Piece(
                 (SAVE_HALFWAY,),
                 lambda _: signals["first"].shifted(first).derivatives,
+                external_long.shifted(first),
                 DoStep(middle, second, False),
                 *self._comparison,
             )
             y_middle, comparison = self._requests.take([small_piece, comparison_piece])
             before_second = (RESTORE_HALFWAY,)
 
-        pushed = history.pushed(middle, y_middle.take(self._source, axis=1))
+        pushed = history.pushed(middle, self._coupled.inputs_of(y_middle))
         second_piece = Piece(
             before_second,
             inputs_of("second", pushed, end),
+            external_second,
             DoStep(middle, second, False),
             *self._solution,
         )
@@ -176,5 +189,5 @@ class DoubleStepper:
         """Around the newest point of ``history``, with what is ``known`` at the later ``time``."""
         ahead = self._scheme.known_ahead
         if ahead:
-            history = history.pushed(time, known[:, self._source])
+            history = history.pushed(time, self._coupled.inputs_of(known))
         return self._scheme.extrapolation.signal(history, polynomials, ahead)

@@ -40,7 +40,7 @@ class FixedRun:
         wanted = settings.polynomial
         requests = StepRequests(context.group, coupled, scheme)
         results = ResultPoints(settings.output_grid, scheme.has_derivative, start, y)
-        depth, u = wanted.order + 1 + scheme.known_ahead, y[:, coupled.source]
+        depth, u = wanted.order + 1 + scheme.known_ahead, coupled.inputs_of(y)
         history = (
             CouplingHistory.at_rest(start, u, depth, h)
             if settings.rests_before_start
@@ -55,7 +55,8 @@ class FixedRun:
             inputs = partial(self._inputs, history, polynomials, end)
             rest = end - time  # H but for rounding, unless the last step is a shorter one
             step = DoStep(time, h if abs(rest - h) <= rounding else rest, True)
-            piece = Piece((), inputs, step, scheme.get_outputs, scheme.output_rows)
+            external = coupled.external.over(time, end)
+            piece = Piece((), inputs, external, step, scheme.get_outputs, scheme.output_rows)
             try:
                 (y,) = requests.take([piece])
             except BrokenOffError as broken_off:
@@ -63,7 +64,7 @@ class FixedRun:
                 if failed.status is StepStatus.TERMINATED:
                     return f"{failed.slave} ended the simulation after t={time!r} s"
                 raise _error(failed, step) from failed.error
-            history = history.pushed(end, y[:, coupled.source])
+            history = history.pushed(end, coupled.inputs_of(y))
             count_accepted(context.statistics, step.step_size, ((end, y),))
             order = max(polynomial.order for polynomial in polynomials)
             slopes = max(polynomial.derivative_points for polynomial in polynomials)
@@ -77,9 +78,9 @@ class FixedRun:
         self, history: CouplingHistory, polynomials: Polynomials, end: float, known: FloatArray
     ) -> FloatArray:
         """Derivatives of all inputs in a step to ``end``, with what is ``known`` there."""
-        scheme, source = self._context.scheme, self._context.coupled.source
+        scheme, coupled = self._context.scheme, self._context.coupled
         ahead = scheme.known_ahead
-        past = history.pushed(end, known[:, source]) if ahead else history
+        past = history.pushed(end, coupled.inputs_of(known)) if ahead else history
         return scheme.extrapolation.signal(past, polynomials, ahead).derivatives
 
 

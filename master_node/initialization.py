@@ -11,12 +11,23 @@ from collections.abc import Sequence
 import numpy as np
 
 from master_node.configuration import System
+from master_node.discrete_coupling import DiscreteValues, HeldInput
 from master_node.numerics.fixed_point import NoFixedPointError, fixed_point
+from master_node.outputs import Outputs, gather
 from master_node.slave_group import Program, SlaveGroup
-from master_node.system import CoupledSystem
-from protocol.calls import ExitInitializationMode, GetOutputs, Initialize, Reply, SetInputs
+from master_node.start_values import start_values
+from master_node.system import CoupledSystem, SlavePart
+from protocol.calls import (
+    ExitInitializationMode,
+    GetDiscreteOutputs,
+    GetOutputs,
+    Initialize,
+    SetDiscreteInputs,
+    SetInputs,
+)
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
+from protocol.slave import StartValue
 
 _LOOP_ROUNDS = 100
 _LOOP_TOLERANCE = 1e-12
@@ -27,7 +38,7 @@ def initialize(
     coupled: CoupledSystem,
     system: System,
     get_outputs: Sequence[GetOutputs] | None = None,
-) -> FloatArray:
+) -> Outputs:
     """Bring all slaves from instantiated to their first communication point T_0.
 
     Args:
@@ -46,81 +57,138 @@ def initialize(
     """
     simulation = system.simulation
     start = float(simulation.start_time)
-    group.execute_all([_initialize(part.name, coupled, system) for part in coupled.parts], start)
-    y = _propagate(group, coupled, start)
+    group.execute_all([(_initialize(part, system),) for part in coupled.parts], start)
+    _InitializationMode(group, coupled, start).propagate()
     get_outputs = get_outputs or [GetOutputs()] * len(coupled.parts)
-    programs = [(ExitInitializationMode(), get) for get in get_outputs]
+    programs = [
+        (ExitInitializationMode(), *_read(part, get))
+        for part, get in zip(coupled.parts, get_outputs, strict=True)
+    ]
     replies = group.execute_all(programs, start)
-    y = gather(coupled, replies, -1, 1 + max(get.order for get in get_outputs))
-    finite = np.isfinite(y).all(axis=0)
+    outputs = gather(coupled, replies, 1 + max(get.order for get in get_outputs))
+    finite = np.isfinite(outputs.y).all(axis=0)
     if not finite.all():
         name = coupled.output_names[int(np.argmin(finite))]
         raise SlaveError(f"{name} is not finite", phase="initialization", time=start)
-    return y
+    return outputs
 
 
-def gather(
-    coupled: CoupledSystem, replies: Sequence[Reply], position: int, rows: int = 1
-) -> FloatArray:
-    """The outputs at one position of each reply, shape (rows, m); rows not read are 0."""
-    y = np.zeros((rows, len(coupled.output_names)))
-    for part, reply in zip(coupled.parts, replies, strict=True):
-        values = reply.results[position]
-        assert isinstance(values, np.ndarray)
-        y[: len(values), part.output_slice] = values
-    return y
-
-
-def _initialize(slave: str, coupled: CoupledSystem, system: System) -> Program:
-    part = next(part for part in coupled.parts if part.name == slave)
+def _initialize(part: SlavePart, system: System) -> Initialize:
     simulation = system.simulation
-    return (
-        Initialize(
-            start_time=float(simulation.start_time),
-            stop_time=simulation.end,
-            relative_tolerance=simulation.slave_relative_tolerance,
-            start_values=dict(system.slaves[slave].parameters),
-            inputs=part.inputs,
-            outputs=part.outputs,
-        ),
+    return Initialize(
+        start_time=float(simulation.start_time),
+        stop_time=simulation.end,
+        relative_tolerance=simulation.slave_relative_tolerance,
+        start_values=part.held
+        | start_values(part.description, system.slaves[part.name].parameters),
+        inputs=part.inputs,
+        outputs=part.outputs,
+        discrete_inputs=part.discrete_inputs,
+        discrete_outputs=part.discrete_outputs,
     )
 
 
-def _propagate(group: SlaveGroup, coupled: CoupledSystem, start: float) -> FloatArray:
-    """Y in initialization mode after enough rounds for every level to have settled."""
-    starts = np.concatenate([part.input_starts for part in coupled.parts])
-    replies = group.execute_all([(GetOutputs(),) for _ in coupled.parts], start)
-    y: FloatArray = gather(coupled, replies, -1)[0]
-    if coupled.initialization.loop:
-        return _iterate(group, coupled, start, y)
-    for level in range(int(coupled.initialization.levels.max()) + 1):
-        known = coupled.initialization.levels[coupled.source] <= level
-        y = _round(group, coupled, np.where(known, y[coupled.source], starts), start)
-    return y
+def _read(part: SlavePart, get: GetOutputs) -> Program:
+    return (get, GetDiscreteOutputs()) if part.discrete_outputs else (get,)
 
 
-def _round(group: SlaveGroup, coupled: CoupledSystem, u: FloatArray, start: float) -> FloatArray:
-    programs = [
-        (SetInputs(u[np.newaxis, part.input_slice]), GetOutputs()) for part in coupled.parts
-    ]
-    y: FloatArray = gather(coupled, group.execute_all(programs, start), -1)[0]
-    return y
+class _InitializationMode:
+    """Hands outputs on to inputs while all slaves are in initialization mode."""
 
+    def __init__(self, group: SlaveGroup, coupled: CoupledSystem, start: float) -> None:
+        self._group = group
+        self._coupled = coupled
+        self._start = start
+        self._external = coupled.external.at(start)[np.newaxis]
 
-def _iterate(group: SlaveGroup, coupled: CoupledSystem, start: float, y: FloatArray) -> FloatArray:
-    """Fixed-point iteration for an algebraic loop across slaves."""
-    try:
-        return fixed_point(
-            lambda y: _round(group, coupled, y[coupled.source], start),
-            y,
-            tolerance=_LOOP_TOLERANCE,
-            evaluations=_LOOP_ROUNDS,
+    def propagate(self) -> None:
+        """Set all inputs to what belongs to the outputs, after enough rounds for every level."""
+        coupled, order = self._coupled, self._coupled.initialization
+        starts = np.concatenate([part.input_starts for part in coupled.parts])
+        outputs = self._round([self._external_inputs(part, starts) for part in coupled.parts])
+        if order.loop:
+            self._iterate(outputs)
+            return
+        source_levels = order.levels[coupled.source]
+        for level in range(order.highest + 1):
+            u = np.where(source_levels <= level, coupled.inputs_of(outputs.y[0]), starts)
+            outputs = self._round(self._inputs(u, self._known_discrete_inputs(outputs, level)))
+
+    def _iterate(self, outputs: Outputs) -> None:
+        """Fixed-point iteration for an algebraic loop across slaves."""
+        coupled = self._coupled
+
+        def again(y: FloatArray) -> FloatArray:
+            nonlocal outputs
+            outputs = self._round(
+                self._inputs(coupled.inputs_of(y), self._discrete_inputs(Outputs(y, outputs.d)))
+            )
+            values: FloatArray = outputs.y[0]
+            return values
+
+        try:
+            fixed_point(again, outputs.y[0], tolerance=_LOOP_TOLERANCE, evaluations=_LOOP_ROUNDS)
+        except NoFixedPointError as error:
+            raise SlaveError(
+                f"the algebraic loop {' -> '.join(coupled.initialization.loop)} did not converge "
+                f"in {_LOOP_ROUNDS} rounds; residuals: {self._residuals(error.residual)}",
+                phase="initialization",
+                time=self._start,
+                remedy="break the loop, or give start values nearer to its solution",
+            ) from None
+
+    def _residuals(self, residual: FloatArray) -> str:
+        """The largest ones, by the names of their outputs."""
+        worst = np.argsort(-np.abs(residual))[:3]
+        return ", ".join(f"{self._coupled.output_names[i]} {residual[i]:.3g}" for i in worst)
+
+    def _external_inputs(self, part: SlavePart, starts: FloatArray) -> Program:
+        """The calls that set what is known before any output is."""
+        if not part.external:
+            return ()
+        return (SetInputs(part.columns(starts[np.newaxis], self._external)),)
+
+    def _inputs(self, u: FloatArray, d: Sequence[DiscreteValues]) -> list[Program]:
+        """The calls that set all inputs of each slave."""
+        return [
+            (SetInputs(part.columns(u[np.newaxis], self._external)), *_discrete(values))
+            for part, values in zip(self._coupled.parts, d, strict=True)
+        ]
+
+    def _known_discrete_inputs(self, outputs: Outputs, level: int) -> list[DiscreteValues]:
+        """The discrete inputs, with start values for those whose outputs are of higher levels."""
+        order, discrete = self._coupled.initialization, self._coupled.discrete
+
+        def value(held: HeldInput) -> StartValue:
+            if held.output is not None:
+                source_level = order.discrete_levels[held.output]
+            else:
+                source_level = order.levels[held.continuous_output]
+            if source_level > level and held.start is not None:
+                return held.start
+            return held.value(outputs.y[0], outputs.d)
+
+        return [tuple(map(value, inputs)) for inputs in discrete.inputs]
+
+    def _discrete_inputs(self, outputs: Outputs) -> list[DiscreteValues]:
+        discrete = self._coupled.discrete
+        return [
+            discrete.inputs_of(slave, outputs.y, outputs.d)
+            for slave in range(len(self._coupled.parts))
+        ]
+
+    def _round(self, programs: Sequence[Program]) -> Outputs:
+        """Execute these calls and read all outputs."""
+        get = GetOutputs()
+        replies = self._group.execute_all(
+            [
+                (*p, *_read(part, get))
+                for p, part in zip(programs, self._coupled.parts, strict=True)
+            ],
+            self._start,
         )
-    except NoFixedPointError as error:
-        raise SlaveError(
-            f"the algebraic loop {' -> '.join(coupled.initialization.loop)} did not converge in "
-            f"{_LOOP_ROUNDS} rounds; residual {np.abs(error.residual).max():.3g}",
-            phase="initialization",
-            time=start,
-            remedy="break the loop, or give start values nearer to its solution",
-        ) from None
+        return gather(self._coupled, replies)
+
+
+def _discrete(values: DiscreteValues) -> Program:
+    return (SetDiscreteInputs(values),) if values else ()

@@ -24,7 +24,7 @@ class InputDefects:
     def __init__(
         self, coupled: CoupledSystem, scheme: CouplingScheme, control: ErrorControl
     ) -> None:
-        self._source = coupled.source
+        self._coupled = coupled
         self._names = coupled.output_names
         self._extrapolation = scheme.extrapolation
         self._known_ahead = scheme.known_ahead
@@ -45,20 +45,20 @@ class InputDefects:
             y: outputs there, shape (rows, m).
             smooth: step size and largest defect of the last accepted step; None: there is none.
         """
-        source, times = self._source, step.times
-        weights = self._control.weights(step.end[0])[source]
+        coupled, times = self._coupled, step.times
+        weights = coupled.weights_of_inputs(self._control.weights(step.end[0]))
         first, second = step.signals
         if self._known_ahead:  # interpolated inputs have no defect that would show a jump
             first = self._extrapolation.signal(history, step.polynomials)
             second = self._extrapolation.signal(step.history, step.polynomials)
-        u_middle, u_end = step.middle[0, source], step.end[0, source]
+        u_middle, u_end = coupled.inputs_of(step.middle[0]), coupled.inputs_of(step.end[0])
         foreseen_middle, foreseen_end = first.at(times.first), second.at(times.second)
         middle, at_middle = measure(u_middle - foreseen_middle, weights)
         end, at_end = measure(u_end - foreseen_end, weights)
         change = foreseen_end - u_middle
         index = at_end
         if middle > end:
-            change = foreseen_middle - y[0, source]
+            change = foreseen_middle - coupled.inputs_of(y[0])
             index = at_middle
         expected = middle * self._growth(step)
         if smooth is not None:
@@ -81,4 +81,4 @@ class InputDefects:
 
     def name(self, defects: Defects) -> str:
         """``slave.variable`` of the output behind the input with the largest defect."""
-        return self._names[int(self._source[defects.input_number])]
+        return self._names[int(self._coupled.source[defects.input_number])]

@@ -59,7 +59,7 @@ class OrderSelection:
         )
         slaves = range(len(coupled.parts))
         self._has_derivative = scheme.input_has_derivative
-        self._slave_of_input = np.repeat(slaves, [len(part.inputs) for part in coupled.parts])
+        self._slave_of_input = np.repeat(slaves, [len(part.connected) for part in coupled.parts])
         kinds_of = {slave: frozenset[int]() for slave in slaves}
         direct = dict.fromkeys(slaves, False)
         for slave, output_kinds, feed_through in zip(
@@ -96,7 +96,11 @@ class OrderSelection:
         outputs = len(coupled.output_names)
         squares = np.bincount(coupled.output_slave, np.square(error.estimate * weights), slaves)
         magnitudes = input_magnitudes(
-            history, self._has_derivative, weights[coupled.source], self._slave_of_input, slaves
+            history,
+            self._has_derivative,
+            coupled.weights_of_inputs(weights),
+            self._slave_of_input,
+            slaves,
         )
         begin, middle, end, step_size, _ = step.times
         nodes = self._control.nodes(step)

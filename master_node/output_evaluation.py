@@ -1,7 +1,8 @@
 """Outputs with direct feed-through, evaluated again at a communication point with its new inputs.
 
 A slave with feed-through computed its outputs at the end of a step with inputs that were
-extrapolated there. As the other slaves' outputs are known by now, those inputs are too: setting
+extrapolated there, or with external ones that it holds constant in each step. As the other
+slaves' outputs are known by now, those inputs are too: setting
 them and reading the outputs again, in the order of the feed-through graph, removes the direct part
 of the error, so that order k + 2 is kept. Where outputs depend on each other in a loop, the loop is
 solved.
@@ -33,11 +34,11 @@ class OutputEvaluation:
 
     def __init__(self, group: SlaveGroup, coupled: CoupledSystem, scheme: CouplingScheme) -> None:
         self._group = group
-        self._source = coupled.source
+        self._coupled = coupled
         self._slaves = scheme.evaluated
         self._parts = [coupled.parts[slave] for slave in self._slaves]
         order = coupled.at_point
-        self._levels = 0 if order.loop else int(order.levels.max())
+        self._levels = 0 if order.loop else max(1, int(order.levels.max()))
         self._loop = order.loop
         self._tolerance = 1e-3 * np.minimum(
             coupled.absolute_tolerance, np.maximum(coupled.relative_tolerance, 1e-12)
@@ -48,12 +49,13 @@ class OutputEvaluation:
         """Whether there is any output to evaluate again."""
         return bool(self._slaves)
 
-    def evaluate(self, y: FloatArray, time: float, step_size: float) -> None:
+    def evaluate(self, y: FloatArray, external: FloatArray, time: float, step_size: float) -> None:
         """Make the values of ``y`` consistent with each other, in place.
 
         Args:
             y: outputs as the slaves gave them at the end of a step, shape (rows, m). Derivatives
                 stay: outputs with feed-through have none.
+            external: values of the external inputs there, shape (n_e,).
             time: where that step began [s], for messages.
             step_size: its size [s], for messages.
 
@@ -63,7 +65,7 @@ class OutputEvaluation:
         """
 
         def again(values: FloatArray) -> FloatArray:
-            return self._round(values, time, step_size)
+            return self._round(values, external, time, step_size)
 
         if not self._loop:
             for _ in range(self._levels):
@@ -81,10 +83,12 @@ class OutputEvaluation:
                 step_size=step_size,
             ) from None
 
-    def _round(self, y: FloatArray, time: float, step_size: float) -> FloatArray:
-        u = y[self._source]
+    def _round(
+        self, y: FloatArray, external: FloatArray, time: float, step_size: float
+    ) -> FloatArray:
+        u, outside = self._coupled.inputs_of(y)[np.newaxis], external[np.newaxis]
         programs: list[Program] = [
-            (SetInputs(u[np.newaxis, part.input_slice]), _GET_OUTPUTS) for part in self._parts
+            (SetInputs(part.columns(u, outside)), _GET_OUTPUTS) for part in self._parts
         ]
         replies = self._group.execute(programs, time, step_size, self._slaves)
         following = y.copy()

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from master_node.co_simulation import CoSimulation, check_capabilities
-from master_node.configuration import System
+from master_node.configuration import InputSettings, System
 from master_node.configure_slaves import configure
+from master_node.input_loading import load_signals
 from master_node.observers import Observer, Observers
 from master_node.results import Recording, Result, ResultsWriter
 from master_node.slave_group import SlaveGroup
@@ -69,12 +70,13 @@ def run(
     """Run a system, streaming into ``directory`` if one is given; raises as `simulate`."""
     settings = settings_of(system, {})
     check_step_sizes(system)
+    signals = load_signals(system)
     writer = None if directory is None else ResultsWriter(directory, settings)
     if writer is not None:
         writer.prepare()
     with _slaves(system, directory, in_process=in_process, launch=launch) as slaves:
         descriptions = configure(slaves.links, system)
-        coupled = resolve(system, descriptions)
+        coupled = resolve(system, descriptions, signals)
         for warning in check_capabilities(coupled, system):
             log.warning("%s", warning)
         if directory is not None:
@@ -109,6 +111,12 @@ def settings_of(system: System, descriptions: Mapping[str, SlaveDescription]) ->
         "smallest_step_size": simulation.smallest,
         "largest_step_size": simulation.largest,
         "slave_tolerance": simulation.slave_relative_tolerance,
+    }
+    settings["inputs"] = {
+        name: value.model_dump(mode="json", exclude_unset=True)
+        if isinstance(value, InputSettings)
+        else value
+        for name, value in system.inputs.items()
     }
     settings["system_file"] = system.source
     settings["models"] = {

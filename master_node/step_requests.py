@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from master_node.coupling_scheme import CouplingScheme
+from master_node.external_inputs import ExternalSignal
 from master_node.numerics.norms import first_not_finite
 from master_node.output_evaluation import OutputEvaluation
 from master_node.slave_group import Program, SlaveGroup
@@ -60,8 +61,8 @@ class FailedStep:
 
 
 Inputs = Callable[[FloatArray], FloatArray]
-"""The input derivatives of all slaves in a step, shape (k + 1, n), from the outputs at its end as
-far as they are known by then, shape (rows, m)."""
+"""The derivatives of all connected inputs in a step, shape (k + 1, n), from the outputs at its end
+as far as they are known by then, shape (rows, m)."""
 
 
 class Piece(NamedTuple):
@@ -70,6 +71,7 @@ class Piece(NamedTuple):
     Attributes:
         before: what each slave does first: save or restore; None: what the last attempt calls for.
         inputs: see `Inputs`.
+        external: the external inputs in it.
         step: the same for all slaves.
         get_outputs: for each slave.
         rows: of its output arrays.
@@ -77,6 +79,7 @@ class Piece(NamedTuple):
 
     before: tuple[Call, ...] | None
     inputs: Inputs
+    external: ExternalSignal
     step: DoStep
     get_outputs: Sequence[GetOutputs]
     rows: int
@@ -102,7 +105,7 @@ class StepRequests:
     def __init__(self, group: SlaveGroup, coupled: CoupledSystem, scheme: CouplingScheme) -> None:
         self._group = group
         self._names = coupled.output_names
-        self._input_slices = [part.input_slice for part in coupled.parts]
+        self._columns = [part.columns for part in coupled.parts]
         self._output_slices = [part.output_slice for part in coupled.parts]
         self._scheme = scheme
         self._evaluation = OutputEvaluation(group, coupled, scheme)
@@ -110,7 +113,7 @@ class StepRequests:
 
     def forget(self) -> None:
         """The state saved at T_n is not needed any more: it is saved anew where a step begins."""
-        self._saved = [False] * len(self._input_slices)
+        self._saved = [False] * len(self._columns)
 
     def take(self, pieces: Sequence[Piece]) -> list[FloatArray]:
         """Take steps from where the slaves stand.
@@ -129,7 +132,9 @@ class StepRequests:
             self._request([piece], [y])
             step = piece.step
             try:
-                self._evaluation.evaluate(y, step.communication_point, step.step_size)
+                self._evaluation.evaluate(
+                    y, piece.external.end, step.communication_point, step.step_size
+                )
             except StepRejectedError as error:
                 failed = FailedStep("", None, float("nan"), error.cause, error)
                 raise BrokenOffError(failed) from None
@@ -163,7 +168,7 @@ class StepRequests:
     def _program(
         self, slave: int, pieces: Sequence[Piece], inputs: Sequence[FloatArray]
     ) -> Program:
-        rows, columns = self._scheme.input_rows[slave], self._input_slices[slave]
+        rows, columns = self._scheme.input_rows[slave], self._columns[slave]
         calls: list[Call] = []
         for piece, derivatives in zip(pieces, inputs, strict=True):
             if piece.before is None:
@@ -171,7 +176,7 @@ class StepRequests:
             else:
                 calls.extend(piece.before)
             calls += (
-                SetInputs(derivatives[:rows, columns]),
+                SetInputs(columns(derivatives[:rows], piece.external.rows)),
                 piece.step,
                 piece.get_outputs[slave],
             )

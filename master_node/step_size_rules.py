@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Sequence
+
 from master_node.configuration import System
+from master_node.external_inputs import Jump
+from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.step_size_limits import (
     SlaveLimits,
     StepSizeLimits,
@@ -31,6 +36,36 @@ def step_size_limits(system: System) -> StepSizeLimits:
             )
         reached = crossing.end
     return limits
+
+
+def crossings(
+    system: System, limits: StepSizeLimits, jumps: Sequence[Jump]
+) -> list[tuple[DoubleStepTimes, str]]:
+    """The double steps that lead over events, in order, each with what it is to be called.
+
+    Args:
+        system: with the declared events.
+        limits: with which these were checked.
+        jumps: of external inputs, in order of time. One too near to another one, to an event or to
+            an end of the simulated time to be crossed by itself is left out.
+    """
+    start, stop = float(system.simulation.start_time), system.simulation.end
+    declared = [
+        (limits.crossing(start, event), "event")
+        for event in sorted(set(map(float, system.simulation.events)))
+    ]
+    begins = [crossing.begin for crossing, _ in declared]
+    found = []
+    reached = start
+    for jump in jumps:
+        crossing = limits.crossing(start, jump.time)
+        following = bisect_right(begins, crossing.begin)
+        free = max([reached, *(c.end for c, _ in declared[:following][-1:])])
+        ahead = min([stop, *begins[following : following + 1]])
+        if free <= crossing.begin and crossing.end <= ahead and crossing.end < stop:
+            found.append((crossing, f"{jump.name} jumps"))
+            reached = crossing.end
+    return sorted(declared + found)
 
 
 def check_step_sizes(system: System) -> None:

@@ -1,23 +1,39 @@
 """Slaves and connections -> index arrays: the coupled system as the algorithm sees it.
 
-u = c(y) of the paper, equation (1b), is here ``y[source]``: each connected input takes the value
-of one output.
+u = c(y) of the paper, equation (1b), is here ``factor * y[source] + offset``: each connected input
+takes the value of one output, in its own unit. What is not continuous goes beside it, as values
+that are held in each step (``discrete_coupling.py``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from master_node.configuration import Connection, SlaveSettings, System
+from master_node.configuration import System
+from master_node.connections import ScalarConnection, VariableFinder, resolve_connections
+from master_node.discrete_coupling import DiscreteCoupling, couple_discrete
+from master_node.external_inputs import ExternalInputs
+from master_node.external_resolution import (
+    Signals,
+    SlaveExternals,
+    max_order,
+    resolve_external,
+)
+from master_node.input_loading import load_signals
+from master_node.tolerances import tolerance
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
 from protocol.signals import FloatArray
-from protocol.slave import Causality, SlaveDescription, Variable, VariableType
+from protocol.slave import Causality, SlaveDescription, StartValue, Variable
+
+_Key = tuple[str, str]
+"""Slave and variable by their names."""
 
 
 @dataclass(frozen=True)
@@ -25,19 +41,67 @@ class SlavePart:
     """One slave's part of the whole.
 
     Attributes:
-        inputs, outputs: names of its connected inputs and of its continuous real outputs.
-        input_slice, output_slice: where they are in u and y.
-        input_starts: start values of the connected inputs, shape (len(inputs),).
+        inputs: names of its continuous inputs that are driven: first the connected ones, then the
+            external ones; these are the columns of what it is given.
+        outputs: names of its continuous real outputs.
+        discrete_inputs, discrete_outputs: names of its other connected inputs, and of its other
+            outputs.
+        held: values of its other external inputs, by name.
+        input_slice, output_slice: where its connected inputs and its outputs are in u and y.
+        external_slice: where its external inputs are among those of the system.
+        external_rows: how many rows of derivatives these need at most.
+        input_starts: start values of the connected inputs.
         description: as the slave gave it.
     """
 
     name: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    discrete_inputs: tuple[str, ...]
+    discrete_outputs: tuple[str, ...]
+    held: dict[str, StartValue]
     input_slice: slice
     output_slice: slice
+    external_slice: slice
+    external_rows: int
     input_starts: FloatArray
     description: SlaveDescription
+
+    @property
+    def connected(self) -> tuple[str, ...]:
+        """Names of its connected continuous inputs."""
+        return self.inputs[: self.input_slice.stop - self.input_slice.start]
+
+    @property
+    def external(self) -> tuple[str, ...]:
+        """Names of its external inputs."""
+        return self.inputs[len(self.connected) :]
+
+    @property
+    def max_order(self) -> int:
+        """The highest degree of input polynomial that it follows."""
+        return max_order(self.description)
+
+    def columns(self, connected: FloatArray, external: FloatArray) -> FloatArray:
+        """Its inputs out of those of the system.
+
+        Args:
+            connected: derivatives of all connected inputs, shape (rows, n).
+            external: of all external inputs, shape (4, n_e).
+
+        Returns:
+            Derivatives of ``inputs``, shape (rows, len(inputs)), with more rows where the external
+            inputs need them.
+        """
+        own = connected[:, self.input_slice]
+        if not self.external_rows:
+            return own
+        outside = external[: self.external_rows, self.external_slice]
+        number = own.shape[1]
+        both = np.zeros((max(len(own), len(outside)), number + outside.shape[1]))
+        both[: len(own), :number] = own
+        both[: len(outside), number:] = outside
+        return both
 
 
 @dataclass(frozen=True)
@@ -47,11 +111,18 @@ class FeedThroughOrder:
     Attributes:
         levels: the outputs of level l depend on connected inputs fed by outputs of lower levels
             only; shape (m,); empty if there is an algebraic loop.
+        discrete_levels: the same for the discrete outputs.
         loop: ``slave.variable`` along an algebraic loop, else empty.
     """
 
     levels: NDArray[np.intp]
+    discrete_levels: NDArray[np.intp]
     loop: tuple[str, ...]
+
+    @property
+    def highest(self) -> int:
+        """The highest level; 0 without outputs."""
+        return int(max(self.levels.max(initial=0), self.discrete_levels.max(initial=0)))
 
 
 @dataclass(frozen=True)
@@ -61,6 +132,7 @@ class CoupledSystem:
     Attributes:
         parts: the slaves in the order of the system file.
         source: for each connected input the index of its output, shape (n,).
+        factor, offset: from the unit of that output to that of the input, shape (n,).
         output_names, output_units: ``slave.variable`` and units of the m outputs.
         output_slave: for each output the index of its slave, shape (m,).
         feed_through: whether an output depends directly on a connected input, shape (m,).
@@ -68,10 +140,16 @@ class CoupledSystem:
         relative_tolerance: RTOL_j, shape (m,).
         initialization, at_point: the order in which values propagate through the slaves in
             initialization mode and at a communication point.
+        discrete: all connections and outputs that are not continuous.
+        external: the external inputs.
+        held_feed_through: whether an output depends directly on an external input that changes
+            and is held in each step, shape (m,).
     """
 
     parts: tuple[SlavePart, ...]
     source: NDArray[np.intp]
+    factor: FloatArray
+    offset: FloatArray
     output_names: tuple[str, ...]
     output_units: tuple[str, ...]
     output_slave: NDArray[np.intp]
@@ -80,201 +158,202 @@ class CoupledSystem:
     relative_tolerance: FloatArray
     initialization: FeedThroughOrder
     at_point: FeedThroughOrder
+    discrete: DiscreteCoupling
+    external: ExternalInputs
+    held_feed_through: NDArray[np.bool_]
+
+    @cached_property
+    def _transforms(self) -> bool:
+        return bool((self.factor != 1.0).any() or (self.offset != 0.0).any())
+
+    def inputs_of(self, y: FloatArray) -> FloatArray:
+        """The connected inputs that belong to outputs.
+
+        Args:
+            y: outputs, shape (m,), or with the derivatives in further rows, shape (rows, m).
+
+        Returns:
+            u, shape (n,) or (rows, n), in the units of the inputs.
+        """
+        u: FloatArray = y.take(self.source, axis=-1)
+        if self._transforms:
+            u *= self.factor
+            u[0 if u.ndim > 1 else ...] += self.offset
+        return u
+
+    def weights_of_inputs(self, weights: FloatArray) -> FloatArray:
+        """Weights for inputs, shape (n,), from those for outputs, shape (m,)."""
+        taken: FloatArray = weights.take(self.source)
+        return taken / np.abs(self.factor) if self._transforms else taken
 
 
-def resolve(system: System, descriptions: Mapping[str, SlaveDescription]) -> CoupledSystem:
+def resolve(
+    system: System,
+    descriptions: Mapping[str, SlaveDescription],
+    signals: Signals | None = None,
+) -> CoupledSystem:
     """Check all names and types, and give every input and output its index.
+
+    Args:
+        system: the settings.
+        descriptions: of the slaves.
+        signals: what drives the external inputs; None: loaded here.
 
     Raises:
         ConfigurationError: with the system's source, the table, and the nearest names.
     """
-    ends = [_ends(system, i, c, descriptions) for i, c in enumerate(system.connections)]
-    _check_parameters(system, descriptions)
+    finder = VariableFinder(descriptions)
+    connections = resolve_connections(system, finder)
+    _check_slave_tables(system, finder)
     outputs = {
         name: tuple(v for v in description.of(Causality.OUTPUT) if v.is_continuous_real)
         for name, description in descriptions.items()
     }
-    output_index = {
-        (slave, variable.name): i
-        for i, (slave, variable) in enumerate((s, v) for s in outputs for v in outputs[s])
-    }
-    if not output_index:
+    everything = [(slave, variable) for slave in outputs for variable in outputs[slave]]
+    output_index = {(slave, variable.name): i for i, (slave, variable) in enumerate(everything)}
+    if not output_index and system.simulation.estimator != "none":
         raise ConfigurationError(
-            f"{system.source}: no slave has a continuous real output: there is nothing to control"
+            f"{system.source}: no slave has a continuous real output: there is nothing to control",
+            remedy="use --estimator none with a fixed --step-size",
         )
-    feeding: dict[str, dict[str, tuple[str, str]]] = {name: {} for name in descriptions}
-    for source, (slave, variable) in ends:
-        feeding[slave][variable] = source
-    parts = _parts(descriptions, feeding, outputs)
-    sources = [feeding[part.name][variable] for part in parts for variable in part.inputs]
-    everything = [(s, v) for s in outputs for v in outputs[s]]
-    tolerances = [_tolerance(system, slave, v) for slave, v in everything]
+    feeding: dict[str, dict[str, ScalarConnection]] = {name: {} for name in descriptions}
+    for connection in connections:
+        feeding[connection.target.slave][connection.target.variable.name] = connection
+    external = resolve_external(
+        system, finder, connections, load_signals(system) if signals is None else signals
+    )
+    parts = _parts(descriptions, feeding, outputs, external)
+    feeds = [feeding[part.name][variable] for part in parts for variable in part.connected]
+    tolerances = [tolerance(system, slave, v) for slave, v in everything]
     initial = {part.name: part.description.initial_feed_through for part in parts}
     direct = {part.name: part.description.feed_through for part in parts}
     slave_index = {name: i for i, name in enumerate(descriptions)}
+    discrete = couple_discrete(
+        descriptions,
+        [[feeding[part.name][name] for name in part.discrete_inputs] for part in parts],
+        output_index,
+    )
     return CoupledSystem(
         parts=parts,
-        source=np.array([output_index[source] for source in sources], dtype=np.intp),
+        source=np.array([output_index[feed.source.key] for feed in feeds], dtype=np.intp),
+        factor=np.array([feed.transformation.factor for feed in feeds], dtype=np.float64),
+        offset=np.array([feed.transformation.offset for feed in feeds], dtype=np.float64),
         output_names=tuple(f"{slave}.{v.name}" for slave, v in everything),
         output_units=tuple(v.unit for _, v in everything),
         output_slave=np.array([slave_index[slave] for slave, _ in everything], dtype=np.intp),
-        feed_through=np.array(
-            [
-                not set(part.description.feed_through.get(output, ())).isdisjoint(part.inputs)
-                for part in parts
-                for output in part.outputs
-            ]
-        ),
+        feed_through=_depends(parts, {part.name: part.connected for part in parts}),
         absolute_tolerance=np.array([absolute for absolute, _ in tolerances]),
         relative_tolerance=np.array([relative for _, relative in tolerances]),
-        initialization=_feed_through_order(output_index, initial, feeding),
-        at_point=_feed_through_order(output_index, direct, feeding),
+        initialization=_feed_through_order(output_index, discrete, initial, feeding),
+        at_point=_feed_through_order(output_index, discrete, direct, feeding),
+        discrete=discrete,
+        external=ExternalInputs([one for each in external.values() for one in each.continuous]),
+        held_feed_through=_depends(
+            parts,
+            {
+                name: [
+                    one.variable
+                    for one in each.continuous
+                    if not one.is_constant and not one.degree
+                ]
+                for name, each in external.items()
+            },
+        ),
+    )
+
+
+def _depends(parts: Sequence[SlavePart], inputs: Mapping[str, Sequence[str]]) -> NDArray[np.bool_]:
+    """Whether each output depends directly on one of these inputs of its slave, shape (m,)."""
+    return np.array(
+        [
+            not set(part.description.feed_through.get(output, ())).isdisjoint(inputs[part.name])
+            for part in parts
+            for output in part.outputs
+        ],
+        dtype=np.bool_,
     )
 
 
 def _parts(
     descriptions: Mapping[str, SlaveDescription],
-    feeding: Mapping[str, Mapping[str, tuple[str, str]]],
+    feeding: Mapping[str, Mapping[str, ScalarConnection]],
     outputs: Mapping[str, tuple[Variable, ...]],
+    external: Mapping[str, SlaveExternals],
 ) -> tuple[SlavePart, ...]:
     parts = []
-    n = m = 0
+    n = m = n_e = 0
     for name, description in descriptions.items():
-        inputs = [v for v in description.of(Causality.INPUT) if v.name in feeding[name]]
+        connected = [v for v in description.of(Causality.INPUT) if v.name in feeding[name]]
+        inputs = [v for v in connected if feeding[name][v.name].is_continuous]
         parts.append(
             SlavePart(
                 name=name,
-                inputs=tuple(v.name for v in inputs),
+                inputs=(
+                    *(v.name for v in inputs),
+                    *(one.variable for one in external[name].continuous),
+                ),
                 outputs=tuple(v.name for v in outputs[name]),
+                discrete_inputs=tuple(
+                    v.name for v in connected if not feeding[name][v.name].is_continuous
+                ),
+                discrete_outputs=tuple(
+                    v.name for v in description.of(Causality.OUTPUT) if not v.is_continuous_real
+                ),
+                held=external[name].held,
                 input_slice=slice(n, n + len(inputs)),
                 output_slice=slice(m, m + len(outputs[name])),
+                external_slice=slice(n_e, n_e + len(external[name].continuous)),
+                external_rows=max((1 + one.degree for one in external[name].continuous), default=0),
                 input_starts=np.array([float(v.start or 0.0) for v in inputs]),
                 description=description,
             )
         )
         n += len(inputs)
         m += len(outputs[name])
+        n_e += len(external[name].continuous)
     return tuple(parts)
 
 
-_End = tuple[str, str]
-
-
-def _ends(
-    system: System,
-    number: int,
-    connection: Connection,
-    descriptions: Mapping[str, SlaveDescription],
-) -> tuple[_End, _End]:
-    """(slave, variable) of both ends of a connection, checked."""
-    where = f"{system.source}: [[connections]] number {number + 1}"
-    source, output = _variable(where, "from", connection.source, descriptions)
-    target, input_ = _variable(where, "to", connection.target, descriptions)
-    if output.causality is not Causality.OUTPUT:
-        outputs = [v.name for v in descriptions[source].of(Causality.OUTPUT)]
-        raise ConfigurationError(
-            f"{where}: from = {connection.source!r} is not an output but of causality "
-            f"{output.causality}{nearest(output.name, outputs)}"
-        )
-    if input_.causality is not Causality.INPUT:
-        inputs = [v.name for v in descriptions[target].of(Causality.INPUT)]
-        raise ConfigurationError(
-            f"{where}: to = {connection.target!r} is not an input but of causality "
-            f"{input_.causality}{nearest(input_.name, inputs)}"
-        )
-    if output.type is not input_.type:
-        raise ConfigurationError(
-            f"{where}: {connection.source} is of type {output.type}, "
-            f"{connection.target} of type {input_.type}"
-        )
-    for name, variable in ((connection.source, output), (connection.target, input_)):
-        if variable.type is not VariableType.REAL or not output.is_continuous_real:
-            raise ConfigurationError(
-                f"{where}: {name} is a {variable.variability} variable of type {variable.type}; "
-                "this version couples continuous variables of type Real"
-            )
-    for earlier in system.connections[:number]:
-        if earlier.target == connection.target:
-            raise ConfigurationError(
-                f"{where}: {connection.target} is driven twice: by {earlier.source} and by "
-                f"{connection.source}"
-            )
-    return (source, output.name), (target, input_.name)
-
-
-def _variable(
-    where: str, key: str, reference: str, descriptions: Mapping[str, SlaveDescription]
-) -> tuple[str, Variable]:
-    """The slave and the variable that ``slave.variable`` means; both names may hold dots."""
-    candidates = [name for name in descriptions if reference.startswith(f"{name}.")]
-    if not candidates:
-        slave = reference.partition(".")[0]
-        raise ConfigurationError(
-            f"{where}: {key} = {reference!r}: no slave {slave!r}{nearest(slave, descriptions)}"
-        )
-    for slave in sorted(candidates, key=len, reverse=True):
-        name = reference[len(slave) + 1 :]
-        try:
-            return slave, descriptions[slave].variable(name)
-        except KeyError:
-            continue
-    slave = max(candidates, key=len)
-    name = reference[len(slave) + 1 :]
-    names = [v.name for v in descriptions[slave].variables]
-    raise ConfigurationError(
-        f"{where}: {key} = {reference!r}: {slave} has no variable {name!r}{nearest(name, names)}"
-    )
-
-
-def _check_parameters(system: System, descriptions: Mapping[str, SlaveDescription]) -> None:
+def _check_slave_tables(system: System, finder: VariableFinder) -> None:
     for slave, settings in system.slaves.items():
-        names = [v.name for v in descriptions[slave].variables]
-        outputs = [v.name for v in descriptions[slave].of(Causality.OUTPUT)]
-        for table, given, known in (
-            ("parameters", settings.parameters, names),
+        outputs = [v.name for v in finder.descriptions[slave].of(Causality.OUTPUT)]
+        tables: list[tuple[str, Mapping[str, object], Sequence[str]]] = [
+            ("parameters", settings.parameters, finder.names(slave)),
             ("tolerances", settings.tolerances, outputs),
-        ):
+        ]
+        for table, given, known in tables:
+            names = frozenset(known)
             for name in given:
-                if name not in known:
+                if name not in names:
                     raise ConfigurationError(
                         f"{system.source}: [slaves.{slave}.{table}] {name!r}: "
                         f"no such variable{nearest(name, known)}"
                     )
 
 
-def _tolerance(system: System, slave: str, variable: Variable) -> tuple[float, float]:
-    """ATOL_j and RTOL_j: of the output, else of its slave, else of the simulation."""
-    settings: SlaveSettings = system.slaves[slave]
-    own = settings.tolerances.get(variable.name)
-    simulation = system.simulation
-    absolute = [own.absolute] if own else []
-    relative = [own.relative] if own else []
-    absolute += [settings.absolute_tolerance, simulation.absolute_tolerance]
-    relative += [settings.relative_tolerance, simulation.relative_tolerance]
-    atol = next(value for value in absolute if value is not None)
-    rtol = next(value for value in relative if value is not None)
-    return atol * variable.nominal, rtol
-
-
 def _feed_through_order(
-    output_index: Mapping[_End, int],
+    output_index: Mapping[_Key, int],
+    discrete: DiscreteCoupling,
     feed_through: Mapping[str, Mapping[str, tuple[str, ...]]],
-    feeding: Mapping[str, Mapping[str, _End]],
+    feeding: Mapping[str, Mapping[str, ScalarConnection]],
 ) -> FeedThroughOrder:
     depends = {
         (slave, output): [
-            feeding[slave][name]
+            feeding[slave][name].source.key
             for name in feed_through[slave].get(output, ())
             if name in feeding[slave]
         ]
-        for slave, output in output_index
+        for slave, output in (*output_index, *discrete.keys)
     }
-    levels = np.zeros(len(output_index), dtype=np.intp)
+    level: dict[_Key, int] = {}
     try:
         for output in TopologicalSorter(depends).static_order():
-            below = [levels[output_index[source]] + 1 for source in depends[output]]
-            levels[output_index[output]] = max(below, default=0)
+            level[output] = max((level[source] + 1 for source in depends[output]), default=0)
     except CycleError as error:
         loop = tuple(f"{slave}.{variable}" for slave, variable in error.args[1])
-        return FeedThroughOrder(np.empty(0, dtype=np.intp), loop)
-    return FeedThroughOrder(levels, ())
+        return FeedThroughOrder(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp), loop)
+    return FeedThroughOrder(
+        np.array([level[key] for key in output_index], dtype=np.intp),
+        np.array([level[key] for key in discrete.keys], dtype=np.intp),
+        (),
+    )

@@ -64,6 +64,13 @@ def oscillator_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def quarter_car_ssp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package of the example, with a nested system."""
+    (package,) = _example("ssp", "build").build(tmp_path_factory.mktemp("ssp"))
+    return Path(package)
+
+
+@pytest.fixture(scope="session")
 def oscillators() -> ModuleType:
     """The reference solutions of the oscillators."""
     return _example("oscillators", "oscillators")

@@ -32,6 +32,7 @@ from master_node import simulate
 from master_node.configuration import (
     BusSettings,
     Connection,
+    InputSettings,
     OutputTolerance,
     SimulationSettings,
     SlaveSettings,
@@ -230,9 +231,11 @@ def test_the_system_file_of_the_readme_is_the_example(tmp_path: Path) -> None:
     load_system(tmp_path / "system.toml")
 
 
-def test_the_tolerances_in_the_document_of_system_files_are_valid() -> None:
-    """Tolerances of one output can be written as shown."""
-    (text,) = blocks(read("docs/system-file.md"), "toml")
+def test_the_examples_in_the_document_of_system_files_are_valid() -> None:
+    """Tolerances of one output, and inputs, can be written as shown."""
+    text, inputs = blocks(read("docs/system-file.md"), "toml")
+    driven = System(slaves={"wheel": {}}, **tomllib.loads(inputs)).inputs
+    assert driven["wheel.z"] == InputSettings(table="road.csv", column="z")
     table = tomllib.loads(text)["slaves"]["wheel"]
     settings = System(slaves={"wheel": {"model": "wheel.fmu", **table}}).slaves["wheel"]
     assert settings.tolerances["v"] == OutputTolerance(absolute=1e-3, relative=1e-3)
@@ -299,6 +302,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "## `[slaves.NAME]`": SlaveSettings,
     "## `[slaves.NAME.tolerances.OUTPUT]`": OutputTolerance,
     "## `[[connections]]`": Connection,
+    "## `[inputs]`": InputSettings,
     "## `[bus]`": BusSettings,
 }
 

@@ -17,6 +17,7 @@ from fmpy import platform
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from protocol.archives import MAX_ENTRIES
 from protocol.calls import (
     DoStep,
     ExitInitializationMode,
@@ -30,7 +31,7 @@ from protocol.errors import ModelError, SlaveError, StepRejectedError
 from protocol.signals import InputSignal
 from protocol.slave import Causality, StepStatus, VariableType
 from slave_node.executor import Executor
-from slave_node.fmu.archive import MAX_ENTRIES, extract
+from slave_node.fmu.archive import extract
 from slave_node.fmu.description import describe_fmu
 from slave_node.fmu.fmi2 import Fmi2Slave
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,14 @@ from hypothesis import strategies as st
 from master_node import System
 from master_node.system import CoupledSystem, resolve
 from protocol.errors import ConfigurationError
-from protocol.slave import Causality, SlaveDescription, Variable, VariableType
+from protocol.slave import Causality, SlaveDescription, Unit, Variable, VariableType
 from tests.quarter_car_case import STATES, car, load_slave
 
 INPUT, OUTPUT, LOCAL = Causality.INPUT, Causality.OUTPUT, Causality.LOCAL
+
+
+SECOND = (0, 0, 1, 0, 0, 0, 0, 0)
+KELVIN = (0, 0, 0, 0, 1, 0, 0, 0)
 
 
 def described(
@@ -294,32 +299,100 @@ def test_an_input_driven_twice() -> None:
     ("output", "input_", "words"),
     [
         (
-            Variable("y", OUTPUT, VariableType.BOOLEAN, "discrete"),
-            Variable("u", INPUT),
-            "a.y is of type Boolean, b.u of type Real",
-        ),
-        (
             Variable("y", OUTPUT),
             Variable("u", INPUT, VariableType.INTEGER, "discrete"),
-            "a.y is of type Real, b.u of type Integer",
+            "a.y is of type Real, b.u of type Integer, and values could be lost",
         ),
         (
-            Variable("y", OUTPUT, VariableType.INTEGER, "discrete"),
-            Variable("u", INPUT, VariableType.INTEGER, "discrete"),
-            "a.y is a discrete variable of type Integer; this version couples continuous",
-        ),
-        (
-            Variable("y", OUTPUT, variability="discrete"),
-            Variable("u", INPUT),
-            "a.y is a discrete variable of type Real; this version couples continuous",
+            Variable("y", OUTPUT, VariableType.STRING, "discrete"),
+            Variable("u", INPUT, VariableType.BOOLEAN, "discrete"),
+            "a.y is of type String, b.u of type Boolean, and values could be lost",
         ),
     ],
 )
 def test_types_must_match(output: Variable, input_: Variable, words: str) -> None:
-    """Both ends are named with their types; what this version cannot couple is said so."""
+    """Both ends are named with their types where a value could be lost."""
     descriptions = {"a": described("", "x", output), "b": described("", "", input_)}
     with pytest.raises(ConfigurationError, match=re.escape(f"number 1: {words}")):
         resolved(descriptions, ("a.y", "b.u"))
+
+
+def test_what_is_not_continuous_goes_beside() -> None:
+    """Discrete variables have their own indices, and reach inputs by casts that lose nothing."""
+    descriptions = {
+        "a": described(
+            "",
+            "x",
+            Variable("n", OUTPUT, VariableType.INTEGER, "discrete"),
+            Variable("on", OUTPUT, VariableType.BOOLEAN, "discrete"),
+        ),
+        "b": described(
+            "",
+            "y",
+            Variable("n", INPUT, VariableType.INT64, "discrete"),
+            Variable("level", INPUT),
+            Variable("sampled", INPUT, variability="discrete"),
+        ),
+    }
+    coupled = resolved(descriptions, ("a.n", "b.n"), ("a.on", "b.level"), ("a.x", "b.sampled"))
+    assert coupled.output_names == ("a.x", "b.y")
+    assert coupled.discrete.names == ("a.n", "a.on")
+    assert coupled.parts[1].inputs == ()
+    assert coupled.parts[1].discrete_inputs == ("n", "level", "sampled")
+    values = coupled.discrete.inputs_of(1, np.array([2.5, 7.0]), (3, True))
+    assert values == (3, 1.0, 2.5)
+    assert [type(value) for value in values] == [int, float, float]
+
+
+def test_arrays_are_connected_element_by_element() -> None:
+    """The name of an array stands for its elements in order; sizes must agree."""
+    elements = [f"A[{i},{j}]" for i in (1, 2) for j in (1, 2, 3)]
+    descriptions = {
+        "a": described("", " ".join(elements)),
+        "b": described(" ".join(elements), "y"),
+        "c": described("A[1] A[2]", ""),
+    }
+    coupled = resolved(descriptions, ("a.A", "b.A"))
+    assert coupled.parts[1].inputs == tuple(elements)
+    assert [coupled.output_names[i] for i in coupled.source] == [f"a.{name}" for name in elements]
+    with pytest.raises(ConfigurationError, match=re.escape("elements up to [2,3], c.A has")):
+        resolved(descriptions, ("a.A", "c.A"))
+
+
+def test_units_are_converted() -> None:
+    """U = factor y + offset by both units' definitions; weights keep their meaning."""
+    millimetre, celsius = Unit((0, 1, 0, 0, 0, 0, 0, 0), 1e-3), Unit(KELVIN, 1.0, 273.15)
+    source = replace(
+        described("", "", Variable("x", OUTPUT, unit="mm"), Variable("T", OUTPUT, unit="degC")),
+        units={"mm": millimetre, "degC": celsius},
+    )
+    target = replace(
+        described("", "y", Variable("x", INPUT, unit="m"), Variable("T", INPUT, unit="K")),
+        units={"m": Unit((0, 1, 0, 0, 0, 0, 0, 0)), "K": Unit(KELVIN)},
+    )
+    coupled = resolved({"a": source, "b": target}, ("a.x", "b.x"), ("a.T", "b.T"))
+    y = np.array([[1500.0, 20.0, 0.0], [4.0, 5.0, 0.0]])
+    assert coupled.inputs_of(y[0]).tolist() == [1.5, 293.15]
+    assert coupled.inputs_of(y).tolist() == [[1.5, 293.15], [0.004, 5.0]]
+    assert coupled.weights_of_inputs(np.array([1.0, 1.0, 1.0])).tolist() == [1000.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("settings", "u"), [({"ignore_units": True}, 3.0), ({"factor": 2.0, "offset": 1.0}, 7.0)]
+)
+def test_a_connection_can_say_how_to_convert(settings: dict[str, Any], u: float) -> None:
+    """``factor`` and ``offset`` are the whole transformation; ``ignore_units`` is none."""
+    source = replace(described("", "", Variable("x", OUTPUT, unit="s")), units={"s": Unit(SECOND)})
+    target = replace(described("", "y", Variable("u", INPUT, unit="K")), units={"K": Unit(KELVIN)})
+    descriptions = {"a": source, "b": target}
+    with pytest.raises(ConfigurationError, match="'s' is s, 'K' is K"):
+        resolved(descriptions, ("a.x", "b.u"))
+    system = System(
+        simulation={"stop_time": 1.0},
+        slaves={"a": {}, "b": {}},
+        connections=[{"from": "a.x", "to": "b.u", **settings}],
+    )
+    assert resolve(system, descriptions).inputs_of(np.array([3.0, 0.0])).tolist() == [u]
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ class ExactStarts:
     def _exact_history(self, times: FloatArray, rows: int) -> CouplingHistory:
         """Exact inputs at ``times``, newest first [s]; with derivatives if ``rows`` is 2."""
         known = [outputs(self.names, times), slopes(self.names, times)][:rows]
-        inputs = np.stack(known, axis=1)[:, :, self._coupled.source]
+        inputs = [self._coupled.inputs_of(row) for row in np.stack(known, axis=1)]
         history = CouplingHistory.start(float(times[-1]), inputs[-1], len(times))
         for time, row in zip(times[-2::-1].tolist(), inputs[-2::-1], strict=True):
             history = history.pushed(time, row)

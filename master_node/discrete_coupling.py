@@ -1,0 +1,124 @@
+"""What is not continuous: integers, booleans, strings, enumerations, binaries, discrete reals.
+
+Such an output is read at communication points, and an input that it feeds is held until the next
+one. It takes no part in extrapolation and in the error norm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from master_node.connections import ScalarConnection
+from master_node.type_casts import Cast
+from master_node.units import Transformation
+from protocol.signals import FloatArray
+from protocol.slave import Causality, SlaveDescription, StartValue, VariableType
+
+DiscreteValues = tuple[StartValue, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class HeldInput:
+    """Where the value of a discrete input comes from.
+
+    Attributes:
+        output: index among the discrete outputs; None if the output is continuous.
+        continuous_output: index among the continuous outputs; None if it is discrete.
+        start: of the input, where its output is not known yet; None: it has none.
+    """
+
+    output: int | None
+    continuous_output: int | None
+    cast: Cast
+    transformation: Transformation
+    start: StartValue | None
+
+    def value(self, y: FloatArray, d: DiscreteValues) -> StartValue:
+        """The value that belongs to outputs ``y``, shape (m,), and discrete outputs ``d``."""
+        if self.output is not None:
+            value = self.cast(d[self.output])
+        else:
+            value = float(y[self.continuous_output])
+        if self.transformation.is_identity:
+            return value
+        assert isinstance(value, float)
+        return self.transformation.factor * value + self.transformation.offset
+
+
+@dataclass(frozen=True)
+class DiscreteCoupling:
+    """The discrete side of a coupled system.
+
+    Attributes:
+        keys: slave and variable of each discrete output.
+        types: of the discrete outputs.
+        output_slices: for each slave where its discrete outputs are among all of them.
+        inputs: for each slave its discrete inputs, in order.
+    """
+
+    keys: tuple[tuple[str, str], ...]
+    types: tuple[VariableType, ...]
+    output_slices: tuple[slice, ...]
+    inputs: tuple[tuple[HeldInput, ...], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """``slave.variable`` of each discrete output."""
+        return tuple(f"{slave}.{variable}" for slave, variable in self.keys)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether all of the system is continuous."""
+        return not self.keys and not any(self.inputs)
+
+    def inputs_of(self, slave: int, y: FloatArray, d: DiscreteValues) -> DiscreteValues:
+        """The discrete inputs of a slave that belong to outputs.
+
+        Args:
+            slave: its index.
+            y: continuous outputs, shape (m,).
+            d: discrete outputs.
+        """
+        return tuple(held.value(y, d) for held in self.inputs[slave])
+
+
+def couple_discrete(
+    descriptions: Mapping[str, SlaveDescription],
+    feeding: Sequence[Sequence[ScalarConnection]],
+    continuous_outputs: Mapping[tuple[str, str], int],
+) -> DiscreteCoupling:
+    """Give every discrete output its index.
+
+    Args:
+        descriptions: of all slaves, in order.
+        feeding: for each slave the connections of its discrete inputs, in order.
+        continuous_outputs: indices of the continuous outputs by slave and variable.
+    """
+    keys: list[tuple[str, str]] = []
+    types = []
+    slices = []
+    for slave, description in descriptions.items():
+        outputs = [v for v in description.of(Causality.OUTPUT) if not v.is_continuous_real]
+        slices.append(slice(len(keys), len(keys) + len(outputs)))
+        keys += [(slave, variable.name) for variable in outputs]
+        types += [variable.type for variable in outputs]
+    index = {key: i for i, key in enumerate(keys)}
+    return DiscreteCoupling(
+        tuple(keys),
+        tuple(types),
+        tuple(slices),
+        tuple(
+            tuple(
+                HeldInput(
+                    index.get(feed.source.key),
+                    continuous_outputs.get(feed.source.key),
+                    feed.cast,
+                    feed.transformation,
+                    feed.target.variable.start,
+                )
+                for feed in feeds
+            )
+            for feeds in feeding
+        ),
+    )

@@ -1,0 +1,254 @@
+"""From ``[inputs]`` to signals: constants, tables from files, functions by their names.
+
+Nothing is started before all of this is read and checked.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping
+from math import isfinite
+from pathlib import Path
+from types import ModuleType
+from zipfile import BadZipFile
+
+import numpy as np
+
+from master_node.configuration import InputRows, InputSettings, System
+from master_node.external_inputs import SignalFunction
+from master_node.numerics.input_tables import InputTableError, Table, make_table
+from protocol.errors import ConfigurationError
+from protocol.names import nearest
+from protocol.signals import FloatArray
+from protocol.slave import StartValue
+
+Columns = Mapping[str, FloatArray]
+"""The columns of a file by name, in its order."""
+
+_READ = {".csv", ".npy", ".npz"}
+
+
+def load_signals(system: System) -> dict[str, StartValue | Table | SignalFunction]:
+    """What drives the inputs in ``[inputs]``, by ``slave.variable``.
+
+    Loading a function runs the code of its module. Files are read once, whatever the number of
+    columns that are used.
+
+    Raises:
+        ConfigurationError: with the system's source and the input.
+    """
+    files: dict[Path, Columns] = {}
+    signals: dict[str, StartValue | Table | SignalFunction] = {}
+    for name, setting in system.inputs.items():
+        try:
+            if not isinstance(setting, InputSettings):
+                signals[name] = setting
+            elif setting.table is not None:
+                signals[name] = _table(setting, setting.table, system, files)
+            else:
+                signals[name] = _function(setting, system)
+        except (ConfigurationError, InputTableError) as error:
+            remedy = getattr(error, "remedy", "")
+            raise ConfigurationError(
+                f"{system.source}: [inputs.{name}] {error.args[0]}", remedy=remedy
+            ) from error.__cause__
+    return signals
+
+
+# ---- Tables -------------------------------------------------------------------------------------
+
+
+def _table(
+    setting: InputSettings, table: str | InputRows, system: System, files: dict[Path, Columns]
+) -> Table:
+    times, values = (
+        (table.times, table.values)
+        if isinstance(table, InputRows)
+        else _rows(setting, system.base / table, files)
+    )
+    span = (float(system.simulation.start_time), system.simulation.end)
+    return make_table(
+        times,
+        values,
+        setting.interpolation,
+        span,
+        extrapolates=setting.extrapolate is not None,
+    )
+
+
+def _rows(
+    setting: InputSettings, path: Path, files: dict[Path, Columns]
+) -> tuple[FloatArray, FloatArray]:
+    if path not in files:
+        files[path] = _read(path)
+    columns = files[path]
+    names = list(columns)
+    time = setting.time if setting.time is not None else names[0]
+    others = [name for name in names if name != time]
+    column = setting.column
+    if column is None:
+        if len(others) != 1:
+            raise ConfigurationError(
+                f"{path.name} has {len(others)} columns beside the times; say which: column = ..."
+            )
+        column = others[0]
+    for key, name in (("time", time), ("column", column)):
+        if name not in columns:
+            raise ConfigurationError(
+                f"{key} = {name!r}: {path.name} has no such column{nearest(name, names)}"
+            )
+    times, values = columns[time], columns[column]
+    if len(times) != len(values):
+        raise ConfigurationError(
+            f"{path.name}: {len(times)} times in {time!r} and {len(values)} values in {column!r}"
+        )
+    return times, values
+
+
+def _read(path: Path) -> Columns:
+    """A file as columns of numbers.
+
+    Raises:
+        ConfigurationError: it is missing, or not what its suffix says.
+    """
+    if path.suffix not in _READ:
+        raise ConfigurationError(f"{path.name}: a table is a file {', '.join(sorted(_READ))}")
+    if not path.is_file():
+        beside = sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))
+        raise ConfigurationError(f"no file {path}{nearest(path.name, beside)}")
+    try:
+        return _read_csv(path) if path.suffix == ".csv" else _read_numpy(path)
+    except OSError as error:
+        raise ConfigurationError(f"{path.name}: cannot be read: {error.strerror}") from error
+
+
+def _read_csv(path: Path) -> Columns:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        try:
+            lines = [line for line in csv.reader(file, strict=True) if line]
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise ConfigurationError(f"{path.name}: not a CSV file: {error}") from error
+    if not lines:
+        raise ConfigurationError(f"{path.name}: is empty")
+    names = [name.strip() for name in lines[0]]
+    if all(_is_number(name) for name in names):
+        raise ConfigurationError(f"{path.name}: the first line must name the columns")
+    if len(set(names)) < len(names):
+        raise ConfigurationError(f"{path.name}: two columns of one name in {', '.join(names)}")
+    for number, line in enumerate(lines[1:], 1):
+        if len(line) != len(names):
+            raise ConfigurationError(
+                f"{path.name}: row {number} has {len(line)} values for {len(names)} columns"
+            )
+        for name, text in zip(names, line, strict=True):
+            if not _is_number(text):
+                raise ConfigurationError(
+                    f"{path.name}: row {number}: {name} = {text!r} is not a number"
+                )
+    numbers = np.array(lines[1:], dtype=float).reshape(-1, len(names))
+    return dict(zip(names, np.ascontiguousarray(numbers.T), strict=True))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_numpy(path: Path) -> Columns:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        arrays = {name: loaded[name] for name in loaded.files} if path.suffix == ".npz" else loaded
+    except (ValueError, EOFError, AttributeError, BadZipFile) as error:
+        raise ConfigurationError(f"{path.name}: not a NumPy file of numbers") from error
+    if isinstance(arrays, np.ndarray):
+        if arrays.dtype.names is not None:
+            arrays = {name: arrays[name] for name in arrays.dtype.names}
+        elif arrays.ndim == 2 and arrays.shape[1] == 2:
+            arrays = {"time": arrays[:, 0], "value": arrays[:, 1]}
+        else:
+            raise ConfigurationError(
+                f"{path.name}: an array of shape {arrays.shape} is neither structured nor of two "
+                "columns, times and values"
+            )
+    for name, array in arrays.items():
+        if array.ndim != 1 or array.dtype.kind not in "fiu":
+            raise ConfigurationError(
+                f"{path.name}: {name} is an array of {array.dtype} of shape {array.shape}, not a "
+                "column of numbers"
+            )
+    if not arrays:
+        raise ConfigurationError(f"{path.name}: is empty")
+    return {name: np.array(array, dtype=float) for name, array in arrays.items()}
+
+
+# ---- Functions ----------------------------------------------------------------------------------
+
+
+def _function(setting: InputSettings, system: System) -> SignalFunction:
+    given = setting.function
+    function = _load_function(given, system.base) if isinstance(given, str) else given
+    assert function is not None
+    start = float(system.simulation.start_time)
+    try:
+        value = float(function(start))
+    except Exception as error:
+        raise ConfigurationError(
+            f"the function fails at t={start!r} s: {type(error).__name__}: {error}"
+        ) from error
+    if not isfinite(value):
+        raise ConfigurationError(f"the function is {value!r} at t={start!r} s")
+    breakpoints = tuple(sorted(set(map(float, setting.breakpoints))))
+    return SignalFunction(function, breakpoints, setting.order)
+
+
+def _load_function(reference: str, base: Path) -> Callable[[float], float]:
+    place, separator, name = reference.rpartition(":")
+    if not (separator and place and name):
+        raise ConfigurationError(
+            f"{reference!r} does not name a function",
+            remedy="write package.module:name or path/to/file.py:name",
+        )
+    module = _from_file(base / place) if place.endswith(".py") else _installed(place)
+    function = getattr(module, name, None)
+    if not callable(function):
+        names = [key for key, value in vars(module).items() if callable(value)]
+        raise ConfigurationError(f"{reference!r}: no function {name!r} there{nearest(name, names)}")
+    return function  # type: ignore[no-any-return]
+
+
+def _from_file(path: Path) -> ModuleType:
+    path = path.resolve()
+    if not path.is_file():
+        beside = sorted(p.name for p in path.parent.glob("*.py"))
+        raise ConfigurationError(f"no file {path}{nearest(path.name, beside)}")
+    # A name of its own, so that it can neither hide nor be hidden by an installed module.
+    name = f"{path.stem}_{hashlib.sha256(bytes(path)).hexdigest()[:16]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None  # a path that ends in .py always has a loader
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and inspect look there
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[name]
+        raise _import_failure(str(path), error) from error
+    return module
+
+
+def _installed(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        raise _import_failure(name, error) from error
+
+
+def _import_failure(place: str, error: BaseException) -> ConfigurationError:
+    return ConfigurationError(f"import of {place} failed: {type(error).__name__}: {error}")

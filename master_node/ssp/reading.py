@@ -1,0 +1,486 @@
+"""Packages and system structure descriptions (SSD), read with all they refer to."""
+
+from __future__ import annotations
+
+import posixpath
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote, urlsplit
+
+from master_node.ssp.parameters import (
+    MappingEntry,
+    check_version,
+    mapped,
+    read_mapping,
+    read_parameter_set,
+    read_transformation,
+)
+from master_node.ssp.structure import (
+    Binding,
+    Component,
+    ConnectionElement,
+    Connector,
+    Notes,
+    Parameter,
+    Structure,
+    SystemElement,
+    Unit,
+    listed,
+)
+from master_node.ssp.xml_nodes import Node, boolean, integer, number, parse
+from protocol.archives import MAX_XML_BYTES, checked_archive
+from protocol.errors import ModelError
+from protocol.names import nearest
+
+SETTINGS_ANNOTATION = "org.doublestep.system"
+SETTINGS_ELEMENT = "urn:doublestep:system"
+"""Namespace of the element in that annotation, whose text is TOML."""
+
+DEFAULT_SSD = "SystemStructure.ssd"
+FMU_TYPE = "application/x-fmu-sharedlibrary"
+SSD_TYPE = "application/x-ssp-definition"
+SSP_TYPE = "application/x-ssp-package"
+SSV_TYPE = "application/x-ssp-parameter-set"
+SSM_TYPE = "application/x-ssp-parameter-mapping"
+
+MAX_DEPTH = 32
+MAX_ELEMENTS = 10_000
+MAX_PACKAGES = 100
+_BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+_TYPES = tuple(
+    f"ssc:{name}"
+    for name in (
+        *("Real", "Float64", "Float32", "Integer", "Boolean", "String", "Enumeration"),
+        *(f"{sign}Int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "U")),
+        "Binary",
+    )
+)
+_KINDS = {
+    *("input", "output", "parameter", "calculatedParameter", "inout"),
+    *("structuralParameter", "constant", "local", "unspecified"),
+}
+
+
+def read_structure(path: Path, scratch: Path, notes: Notes) -> Structure:
+    """Read an ``.ssp`` or ``.ssd`` file with all that it refers to.
+
+    Args:
+        path: the file.
+        scratch: an existing empty directory. A package is extracted into it, nested packages
+            into folders of it; models are there as long as it lives.
+        notes: for what is not carried.
+
+    Raises:
+        ModelError: an archive or a document is missing, cannot be read, or is unsafe.
+        ConfigurationError: something in a document is wrong or not supported, with file and line.
+    """
+    reader = _Reader(scratch, notes)
+    if path.suffix.lower() == ".ssd":
+        return reader.document(_Place(path.absolute().parent, path.name, str(path.parent)))
+    reader.extract(path, scratch)
+    return reader.document(_Place(scratch, DEFAULT_SSD, str(path)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A file of a package or below a folder.
+
+    Attributes:
+        root: directory of the extracted package, or of the SSD.
+        file: relative to it.
+        shown: what to call ``root`` in messages.
+    """
+
+    root: Path
+    file: str
+    shown: str
+
+    @property
+    def path(self) -> Path:
+        return self.root / self.file
+
+    def __str__(self) -> str:
+        return f"{self.shown}/{self.file}"
+
+    def refer(self, node: Node, uri: str) -> tuple[_Place, str]:
+        """The file that a URI means, relative to this one, and the URI's fragment."""
+        parts = urlsplit(uri)
+        name = unquote(parts.path)
+        if parts.scheme or parts.netloc or parts.query:
+            raise node.error(
+                f"source {uri!r:.200} is not a relative URI",
+                "put the file into the package, or beside the SSD",
+            )
+        joined = posixpath.normpath(posixpath.join(posixpath.dirname(self.file), name))
+        if (
+            name.startswith("/")
+            or ".." in PurePosixPath(joined).parts
+            or any(character in name for character in "\\:\0")
+        ):
+            raise node.error(f"source {uri!r:.200} leads outside the folder of the SSD")
+        return replace(self, file=joined), unquote(parts.fragment)
+
+
+class _Reader:
+    def __init__(self, scratch: Path, notes: Notes) -> None:
+        self._scratch = scratch
+        self._notes = notes
+        self._packages = 0
+        self._elements = 0
+
+    def extract(self, package: Path, directory: Path) -> None:
+        """Extract what a system can refer to: descriptions at the root, and resources."""
+        with checked_archive(package, "SSP") as archive:
+            names = archive.namelist()
+            if DEFAULT_SSD not in names:
+                raise ModelError(f"{package}: not an SSP: it holds no {DEFAULT_SSD}")
+            for entry in archive.infolist():
+                parts = PurePosixPath(entry.filename).parts
+                is_description = len(parts) == 1 and entry.filename.lower().endswith(".ssd")
+                if is_description or parts[0] == "resources":
+                    archive.extract(entry, directory)
+                elif not entry.is_dir() and parts[0] != "documentation":
+                    self._notes.tell(f"{package}: entry {entry.filename!r:.200} is not carried")
+            variants = [n for n in names if "/" not in n and n.lower().endswith(".ssd")]
+        if others := [name for name in variants if name != DEFAULT_SSD]:
+            self._notes.tell(f"{package}: variants beside {DEFAULT_SSD}: {listed(others)}")
+
+    def document(self, place: _Place, depth: int = 0) -> Structure:
+        """A system structure description."""
+        root = self._parse(place, "ssd:SystemStructureDescription")
+        check_version(root)
+        root.attribute("name")
+        units = _units(root.child("ssd:Units"))
+        system = root.child("ssd:System")
+        if system is None:
+            raise root.error("holds no ssd:System")
+        settings = _settings(root)
+        experiment = root.child("ssd:DefaultExperiment")
+        start_time = stop_time = None
+        if experiment is not None:
+            if experiment.has("startTime"):
+                start_time = number(experiment, "startTime")
+            if experiment.has("stopTime"):
+                stop_time = number(experiment, "stopTime")
+            experiment.done()
+        read = _Document(self, place, root, units).system(system, depth)
+        root.done()
+        return Structure(read, start_time, stop_time, settings)
+
+    def nested(self, node: Node, place: _Place, depth: int) -> SystemElement:
+        """The system of a description that a component refers to, without its experiment."""
+        structure = self.document(place, depth + 1)
+        times = (structure.start_time, structure.stop_time)
+        if structure.settings or times != (None, None):
+            self._notes.tell(
+                f"{node.place}: settings and default experiment of {place} are not carried: "
+                "those of the outer system hold"
+            )
+        return structure.system
+
+    def package(self, node: Node, place: _Place, fragment: str) -> _Place:
+        """A nested package, extracted; gives the description in it."""
+        if fragment and ("/" in fragment or not fragment.lower().endswith(".ssd")):
+            raise node.error(f"{fragment!r:.200} does not name an SSD of the package")
+        self._packages += 1
+        if self._packages > MAX_PACKAGES:
+            raise node.error(f"more than {MAX_PACKAGES} packages in one another")
+        directory = self._scratch / "packages" / str(self._packages)
+        directory.mkdir(parents=True)
+        self.extract(place.path, directory)
+        return _Place(directory, fragment or DEFAULT_SSD, str(place))
+
+    def count(self, node: Node, depth: int) -> None:
+        """Bound what references to systems can grow to."""
+        self._elements += 1
+        if depth > MAX_DEPTH or self._elements > MAX_ELEMENTS:
+            raise node.error(
+                f"the system has more than {MAX_ELEMENTS} elements, or is deeper than {MAX_DEPTH}",
+                "look for a system that refers to itself",
+            )
+
+    def parameter_set(self, place: _Place) -> tuple[Parameter, ...]:
+        return read_parameter_set(self._parse(place, "ssv:ParameterSet"))
+
+    def mapping(self, place: _Place) -> tuple[MappingEntry, ...]:
+        return read_mapping(self._parse(place, "ssm:ParameterMapping"))
+
+    def tell(self, sentence: str) -> None:
+        self._notes.tell(sentence)
+
+    def binding(
+        self,
+        node: Node,
+        parameters: tuple[Parameter, ...],
+        mapping: tuple[MappingEntry, ...] | None,
+    ) -> Binding:
+        """Prefix and mapping applied to the parameters of a source."""
+        prefix = node.attribute("prefix")
+        parameters = tuple(replace(p, name=prefix + p.name) for p in parameters)
+        if mapping is not None:
+            parameters = mapped(parameters, mapping, node.place, self._notes)
+        return Binding(parameters, node.place)
+
+    def _parse(self, place: _Place, root: str) -> Node:
+        try:
+            size = place.path.stat().st_size
+            if size > MAX_XML_BYTES:
+                raise ModelError(f"{place} of {size} bytes; limit {MAX_XML_BYTES}")
+            xml = place.path.read_bytes()
+        except OSError as error:
+            raise ModelError(f"{place}: cannot be read: {error.strerror}") from None
+        return parse(xml, str(place), root, self._notes)
+
+
+@dataclass(frozen=True)
+class _Document:
+    """One SSD while it is read."""
+
+    reader: _Reader
+    place: _Place
+    root: Node
+    units: Mapping[str, Unit]
+
+    def system(self, node: Node, depth: int) -> SystemElement:
+        self.reader.count(node, depth)
+        name = node.required("name")
+        connectors = self._connectors(node)
+        bindings = self._bindings(node)
+        elements: dict[str, Component | SystemElement] = {}
+        container = node.child("ssd:Elements")
+        for child in _children(container, "ssd:Component", "ssd:System"):
+            element = (
+                self._component(child, depth + 1)
+                if child.name == "ssd:Component"
+                else self.system(child, depth + 1)
+            )
+            if element.name in elements:
+                raise child.error(f"there are two elements {element.name!r}")
+            elements[element.name] = element
+        if container is not None:
+            for reference in container.children("ssd:SignalDictionaryReference"):
+                raise reference.error(
+                    "signal dictionaries are not supported", "connect the components directly"
+                )
+            container.done()
+        connections = node.child("ssd:Connections")
+        read = tuple(self._connection(c) for c in _children(connections, "ssd:Connection"))
+        if connections is not None:
+            connections.done()
+        node.done()
+        return SystemElement(name, connectors, elements, read, bindings, node.place)
+
+    def _component(self, node: Node, depth: int) -> Component | SystemElement:
+        name = node.required("name")
+        kind = node.attribute("type", FMU_TYPE).partition(";")[0].strip()
+        if kind not in (FMU_TYPE, SSD_TYPE, SSP_TYPE):
+            raise node.error(
+                f"component {name!r} of type {kind!r:.100} is not supported",
+                "export it as an FMU",
+            )
+        if not node.has("source"):
+            raise node.error(f"component {name!r} has no source", "add the FMU that it stands for")
+        source = node.required("source")
+        implementation = node.attribute("implementation", "any")
+        if implementation == "ModelExchange":
+            self.reader.tell(
+                f"{node.place}: {name!r} asks for ModelExchange; what its FMU offers is taken"
+            )
+        elif implementation not in ("any", "CoSimulation"):
+            raise node.error(f"implementation {implementation!r:.60} is not supported")
+        connectors = self._connectors(node)
+        bindings = self._bindings(node)
+        target, fragment = self.place.refer(node, source)
+        if kind == FMU_TYPE:
+            self.reader.count(node, depth)
+            component = Component(
+                name, self._fmu(node, target, fragment), connectors, bindings, node.place
+            )
+            node.done()
+            return component
+        system = self._referred(node, kind, target, fragment, depth)
+        for connector in connectors:
+            if connector not in system.connectors:
+                self.reader.tell(
+                    f"{connectors[connector].place}: connector {connector!r} of {name!r} is not "
+                    f"one of the system that it refers to{nearest(connector, system.connectors)}"
+                )
+        node.done()
+        return replace(system, name=name, bindings=(*system.bindings, *bindings))
+
+    def _referred(
+        self, node: Node, kind: str, target: _Place, fragment: str, depth: int
+    ) -> SystemElement:
+        if kind == SSP_TYPE:
+            return self.reader.nested(node, self.reader.package(node, target, fragment), depth)
+        if target.path.is_dir() and fragment:  # a source of nothing but a fragment
+            system = self.root.with_id(fragment)
+            if system is None:
+                raise node.error(f"no ssd:System has the id {fragment!r:.100}")
+            return self.system(system, depth + 1)
+        if fragment:
+            raise node.error(f"fragment {fragment!r:.100} of another SSD is not supported")
+        return self.reader.nested(node, target, depth)
+
+    def _fmu(self, node: Node, target: _Place, fragment: str) -> Path:
+        if fragment or not target.file.lower().endswith(".fmu"):
+            raise node.error(f"{target} is not an .fmu file", "rename it, and its source too")
+        if not target.path.is_file():
+            raise ModelError(f"{node.place}: {target}: no such file")
+        return target.path
+
+    def _connectors(self, node: Node) -> dict[str, Connector]:
+        connectors: dict[str, Connector] = {}
+        container = node.child("ssd:Connectors")
+        for child in _children(container, "ssd:Connector"):
+            connector = self._connector(child)
+            if connector.name in connectors:
+                raise child.error(f"there are two connectors {connector.name!r}")
+            connectors[connector.name] = connector
+        if container is not None:
+            container.done()
+        return connectors
+
+    def _connector(self, node: Node) -> Connector:
+        kind = node.required("kind")
+        if kind not in _KINDS:
+            raise node.error(f"kind {kind!r:.60} is not known")
+        problem = "" if kind not in ("inout", "unspecified") else f"kind {kind}"
+        unit = None
+        types = node.children(*_TYPES)
+        if len(types) > 1:
+            raise types[1].error("is a second type")
+        for child in types:
+            if child.name == "ssc:Binary":
+                problem = f"type {child.name}"
+            name = child.attribute("unit")
+            if name and name not in self.units:
+                raise child.error(f"unit {name!r} is not in ssd:Units{nearest(name, self.units)}")
+            unit = self.units.get(name)
+            child.attribute("name")
+            child.attribute("mime-type")
+            child.done()
+        if node.children("ssd:Dimension", "ssc:Dimension"):
+            problem = "an array"
+        if node.children("ssd:Clock", "ssc:Clock"):
+            problem = "a clock"
+        connector = Connector(node.required("name"), kind, unit, problem, node.place)
+        node.done()
+        return connector
+
+    def _connection(self, node: Node) -> ConnectionElement:
+        for name in ("startIndices", "endIndices"):
+            if node.has(name):
+                raise node.error(
+                    f"{name}: elements of arrays cannot be connected", "connect scalar variables"
+                )
+        connection = ConnectionElement(
+            start=_end(node, "start"),
+            end=_end(node, "end"),
+            transformation=read_transformation(node),
+            suppress_unit_conversion=boolean(node, "suppressUnitConversion", "false"),
+            place=node.place,
+        )
+        node.done()
+        return connection
+
+    def _bindings(self, node: Node) -> tuple[Binding, ...]:
+        container = node.child("ssd:ParameterBindings")
+        bindings = tuple(
+            self._binding(child) for child in _children(container, "ssd:ParameterBinding")
+        )
+        if container is not None:
+            container.done()
+        return bindings
+
+    def _binding(self, node: Node) -> Binding:
+        place = self._source(node, SSV_TYPE)
+        if place is not None:
+            parameters = self.reader.parameter_set(place)
+        else:
+            parameters = read_parameter_set(
+                _inline(node.child("ssd:ParameterValues") or node, "ssv:ParameterSet")
+            )
+        mapping = None
+        element = node.child("ssd:ParameterMapping")
+        if element is not None:
+            place = self._source(element, SSM_TYPE)
+            mapping = (
+                self.reader.mapping(place)
+                if place is not None
+                else read_mapping(_inline(element, "ssm:ParameterMapping"))
+            )
+            element.done()
+        binding = self.reader.binding(node, parameters, mapping)
+        node.done()
+        return binding
+
+    def _source(self, node: Node, type_: str) -> _Place | None:
+        """The file that a binding or a mapping refers to, None if it stands inline."""
+        given = node.attribute("type", type_)
+        if given != type_:
+            raise node.error(f"type {given!r:.100} is not supported", f"give it as {type_}")
+        if not node.has("source"):
+            return None
+        if node.attribute("sourceBase", "SSD") != "SSD":
+            raise node.error(
+                "sourceBase = 'component' is not supported", "put the file beside the SSD"
+            )
+        place, _ = self.place.refer(node, node.required("source"))
+        return place
+
+
+def _children(node: Node | None, *names: str) -> list[Node]:
+    return node.children(*names) if node is not None else []
+
+
+def _inline(node: Node, name: str) -> Node:
+    child = node.child(name)
+    if child is None:
+        raise node.error(f"has neither a source nor an {name}")
+    node.done()
+    return child
+
+
+def _end(node: Node, which: str) -> tuple[str | None, str]:
+    element = node.required(f"{which}Element") if node.has(f"{which}Element") else None
+    return element, node.required(f"{which}Connector")
+
+
+def _units(node: Node | None) -> dict[str, Unit]:
+    units = {}
+    for child in _children(node, "ssc:Unit"):
+        base = child.child("ssc:BaseUnit")
+        if base is None:
+            raise child.error("has no ssc:BaseUnit")
+        name = child.required("name")
+        exponents = tuple(integer(base, unit, "0") for unit in _BASE_UNITS)
+        factor = number(base, "factor", "1")
+        if factor == 0.0:
+            raise base.error("a factor of 0")
+        units[name] = Unit(name, exponents, factor, number(base, "offset", "0"))
+        base.done()
+        child.done()
+    if node is not None:
+        node.done()
+    return units
+
+
+def _settings(root: Node) -> str:
+    """The TOML text in our own annotation; the other annotations are told."""
+    settings = ""
+    container = root.child("ssd:Annotations")
+    for annotation in _children(container, "ssc:Annotation"):
+        kind = annotation.required("type")
+        if kind == SETTINGS_ANNOTATION:
+            element = annotation.child(f"{SETTINGS_ELEMENT}:Settings")
+            if element is None:
+                raise annotation.error("holds no Settings")
+            settings = element.text
+            annotation.done()
+        else:
+            root.count(f"annotation {kind}")
+    if container is not None:
+        container.done()
+    return settings

@@ -1,0 +1,251 @@
+"""System files of all kinds: TOML, and SSP packages and descriptions.
+
+`open_system` reads any of them, `import_system` and `export_system` turn one kind into the other.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from master_node.configuration import System, load_system
+from master_node.ssp.flattening import Slave, flatten
+from master_node.ssp.reading import read_structure
+from master_node.ssp.structure import Notes, Structure
+from master_node.ssp.writing import write_package
+from protocol.errors import ConfigurationError
+from protocol.keys import check_name
+from protocol.slave import SlaveDescription
+
+log = logging.getLogger("master_node")
+
+_SSP_SUFFIXES = (".ssp", ".ssd")
+
+
+@dataclass(frozen=True)
+class ImportedSystem:
+    """What an SSP file says.
+
+    Attributes:
+        system: its models are where they were extracted to.
+        notes: a sentence for all that is not carried.
+    """
+
+    system: System
+    notes: tuple[str, ...]
+
+
+@contextmanager
+def open_system(path: Path) -> Iterator[System]:
+    """The system in a ``.toml``, ``.ssp`` or ``.ssd`` file.
+
+    The models of a package are extracted into a temporary directory, which is removed at the end:
+    run the system within the ``with``. What an SSP file holds that is not carried is logged.
+
+    Raises:
+        ConfigurationError: the file is missing or wrong, or holds what is not supported.
+    """
+    if path.suffix.lower() not in _SSP_SUFFIXES:
+        yield load_system(path)
+        return
+    with tempfile.TemporaryDirectory(prefix="doublestep-") as scratch:
+        imported = read_ssp(path, Path(scratch))
+        for note in imported.notes:
+            log.warning("%s", note)
+        yield imported.system
+
+
+def read_ssp(path: Path, scratch: Path) -> ImportedSystem:
+    """The system in an ``.ssp`` or ``.ssd`` file.
+
+    Args:
+        path: the file.
+        scratch: an existing empty directory, into which packages are extracted.
+
+    Raises:
+        ConfigurationError: as `open_system`.
+    """
+    notes = Notes(str(path))
+    structure = read_structure(path, scratch, notes)
+    load = entry_points(group="doublestep.in_process")["describe"].load()
+    describe: Callable[[Path], SlaveDescription] = cache(lambda fmu: load(str(fmu), Path()))
+    slaves, connections = flatten(structure.system, describe, notes)
+    base = scratch if path.suffix.lower() == ".ssp" else path.absolute().parent
+    tables = _settings(structure, path, notes)
+    unknown = sorted(tables["slaves"].keys() - {slave.name for slave in slaves})
+    if unknown:
+        raise ConfigurationError(f"{path}: the annotation has settings of {unknown[0]!r}, no slave")
+    system = System(
+        simulation=tables["simulation"],
+        slaves={slave.name: _slave(slave, base, tables["slaves"], path) for slave in slaves},
+        connections=tuple(connections),
+        bus=tables["bus"],
+        base=base,
+        source=str(path),
+    )
+    return ImportedSystem(system, notes.sentences())
+
+
+def import_system(path: Path, output: Path) -> tuple[str, ...]:
+    """Write an ``.ssp`` or ``.ssd`` file as a TOML file.
+
+    FMUs out of packages are copied to a folder beside it, named after it with ``_models``; what
+    is there of these names is overwritten.
+
+    Returns:
+        A sentence for all that is not carried.
+
+    Raises:
+        ConfigurationError: as `open_system`, or a file cannot be written.
+    """
+    _check_suffix(path, *_SSP_SUFFIXES)
+    _check_suffix(output, ".toml")
+    with tempfile.TemporaryDirectory(prefix="doublestep-") as scratch:
+        imported = read_ssp(path, Path(scratch))
+        system = imported.system
+        names = _file_names(system)
+        tables = _tables(system)
+        folder = output.parent / f"{output.stem}_models"
+        try:
+            for name in system.slaves:
+                model = system.base / str(system.slaves[name].model)
+                if model.is_relative_to(scratch):
+                    folder.mkdir(parents=True, exist_ok=True)
+                    shutil.copyfile(model, folder / names[name])
+                    model = folder / names[name]
+                relative = os.path.relpath(model, output.parent)
+                tables["slaves"][name]["model"] = Path(relative).as_posix()
+            _replace(output, lambda file: file.write_text(_toml(tables), encoding="utf-8"))
+        except OSError as error:
+            raise ConfigurationError(f"{output}: cannot be written: {error}") from error
+    return imported.notes
+
+
+def export_system(path: Path, output: Path) -> None:
+    """Write a system as an ``.ssp`` package, with its FMUs.
+
+    Raises:
+        ConfigurationError: a slave has no FMU, a name is wrong, or a file cannot be written.
+    """
+    _check_suffix(output, ".ssp")
+    describe = entry_points(group="doublestep.in_process")["describe"].load()
+    with open_system(path) as system:
+        for name, settings in system.slaves.items():
+            if settings.model is None or not settings.model.lower().endswith(".fmu"):
+                raise ConfigurationError(
+                    f"{system.source}: [slaves.{name}] has no FMU"
+                    + (f" but {settings.model!r}" if settings.model else ""),
+                    remedy="only FMUs can be put into an SSP: export the model as one",
+                )
+        names = _file_names(system)
+        try:
+            _replace(output, lambda file: write_package(system, names, describe, output.stem, file))
+        except OSError as error:
+            raise ConfigurationError(f"{output}: cannot be written: {error}") from error
+
+
+def _settings(structure: Structure, path: Path, notes: Notes) -> dict[str, dict[str, Any]]:
+    """The tables of our own annotation, with the times of the default experiment."""
+    where = f"{path}: the annotation of Doublestep"
+    try:
+        given = tomllib.loads(structure.settings)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{where} is not TOML: {error}") from None
+    tables = {name: given.pop(name, {}) for name in ("simulation", "slaves", "bus")}
+    if given or not all(isinstance(table, dict) for table in tables.values()):
+        raise ConfigurationError(f"{where} holds more than [simulation], [slaves] and [bus]")
+    if tables["bus"].pop("insecure", False):
+        notes.tell(
+            f"{path}: [bus] insecure = true is not taken from a package; say --insecure if you "
+            "trust the network"
+        )
+    if structure.start_time is not None:
+        tables["simulation"]["start_time"] = structure.start_time
+    if structure.stop_time is not None:
+        tables["simulation"]["stop_time"] = structure.stop_time
+    return tables
+
+
+def _slave(slave: Slave, base: Path, settings: dict[str, Any], path: Path) -> dict[str, Any]:
+    given = settings.get(slave.name, {})
+    if not isinstance(given, dict) or given.keys() & {"model", "parameters"}:
+        raise ConfigurationError(
+            f"{path}: the annotation of Doublestep cannot give [slaves.{slave.name}] a model or "
+            "parameters"
+        )
+    inside = slave.model.is_relative_to(base)
+    model = slave.model.relative_to(base).as_posix() if inside else str(slave.model)
+    table: dict[str, Any] = {"model": model}
+    if slave.parameters:
+        table["parameters"] = dict(slave.parameters)
+    return table | given
+
+
+def _file_names(system: System) -> dict[str, str]:
+    """A safe file name for the FMU of each slave; one for slaves that share it."""
+    names: dict[Path, str] = {}
+    result = {}
+    for slave, settings in system.slaves.items():
+        model = (system.base / str(settings.model)).resolve()
+        if model not in names:
+            names[model] = _free_name(model, slave, {name.casefold() for name in names.values()})
+        result[slave] = names[model]
+    return result
+
+
+def _free_name(model: Path, slave: str, taken: set[str]) -> str:
+    stem = model.stem
+    try:
+        check_name(stem)
+    except ConfigurationError:
+        stem = slave
+    name, number = f"{stem}.fmu", 1
+    while name.casefold() in taken:
+        number += 1
+        name = f"{stem}_{number}.fmu"
+    return name
+
+
+def _tables(system: System) -> dict[str, Any]:
+    """What is set in a system, as plain tables."""
+    tables: dict[str, Any] = system.model_dump(
+        mode="python", by_alias=True, exclude_unset=True, exclude_none=True
+    )
+    return tables
+
+
+def _toml(tables: dict[str, Any]) -> str:
+    """A system file, with its tables in the usual order."""
+    parts = [{name: tables[name]} for name in ("simulation", "slaves") if tables.get(name)]
+    texts = [tomli_w.dumps(part) for part in parts]
+    texts += [f"[[connections]]\n{tomli_w.dumps(table)}" for table in tables["connections"]]
+    if tables.get("bus"):
+        texts.append(tomli_w.dumps({"bus": tables["bus"]}))
+    return "\n".join(texts)
+
+
+def _replace(output: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside ``output`` and put it in its place when it is whole."""
+    part = output.with_name(f".{output.name}.part")
+    try:
+        write(part)
+        part.replace(output)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _check_suffix(path: Path, *suffixes: str) -> None:
+    if path.suffix.lower() not in suffixes:
+        raise ConfigurationError(f"{path}: must be a file {' or '.join(suffixes)}")

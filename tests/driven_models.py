@@ -1,0 +1,33 @@
+"""Python models with inputs to drive from outside, loaded by name as those of a user are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from slave_node.model import Model, real
+
+
+class Oscillator(Model):
+    """x'' = 30 (u - x) - x'."""
+
+    inputs = (real("u"),)
+    states = (real("x"), real("v"))
+    outputs = states
+    parameters = (real("stiffness", start=30.0),)
+    solver = "DOP853"
+
+    def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
+        """The states."""
+        return [x[1], self.stiffness * (u[0] - x[0]) - x[1]]
+
+
+class Sum(Model):
+    """y = u + w: nothing but direct feed-through."""
+
+    inputs = (real("u", start=7.0), real("w", start=70.0))
+    outputs = (real("y"),)
+    feed_through = {"y": ("u", "w")}  # noqa: RUF012  as a user writes it
+
+    def output_values(self, t: float, x: Any, u: Any) -> list[float]:
+        """The output."""
+        return [u[0] + u[1]]

@@ -1,0 +1,1150 @@
+"""SSP: what is read of a package, that it runs, and that nothing in it is dropped silently."""
+
+from __future__ import annotations
+
+import stat
+import tomllib
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import fmpy.ssp.ssd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from lxml import etree
+from typer.testing import CliRunner
+
+from master_node import System, load_system, open_system
+from master_node.cli import app
+from master_node.ssp.structure import Linear, Unit
+from master_node.system_files import ImportedSystem, export_system, import_system, read_ssp
+from protocol.errors import ConfigurationError, ModelError
+from tests.quarter_car_case import EXAMPLES
+
+SCHEMAS = Path(fmpy.ssp.__file__).parent / "schema"
+NAMESPACES = "".join(
+    f' xmlns:{prefix}="http://ssp-standard.org/SSP1/SystemStructure{name}"'
+    for prefix, name in (
+        ("ssc", "Common"),
+        ("ssd", "Description"),
+        ("ssv", "ParameterValues"),
+        ("ssm", "ParameterMapping"),
+    )
+)
+UNITS = (
+    '<ssd:Units><ssc:Unit name="m"><ssc:BaseUnit m="1"/></ssc:Unit>'
+    '<ssc:Unit name="mm"><ssc:BaseUnit m="1" factor="0.001"/></ssc:Unit>'
+    '<ssc:Unit name="kg"><ssc:BaseUnit kg="1"/></ssc:Unit></ssd:Units>'
+)
+DIRECT = [
+    ("chassis.x", "wheel.x_c"),
+    ("chassis.v", "wheel.v_c"),
+    ("wheel.x", "chassis.x_w"),
+    ("wheel.v", "chassis.v_w"),
+]
+
+
+def ssd(system: str, after: str = UNITS, version: str = "1.0") -> str:
+    """A description around what is in its root system."""
+    return (
+        f'<ssd:SystemStructureDescription{NAMESPACES} version="{version}" name="test">\n'
+        f'<ssd:System name="root">\n{system}\n</ssd:System>\n{after}\n'
+        "</ssd:SystemStructureDescription>"
+    )
+
+
+def connector(name: str, kind: str, unit: str = "", inner: str = "") -> str:
+    """A connector of type Real, or with what is given."""
+    attribute = f' unit="{unit}"' if unit else ""
+    return (
+        f'<ssd:Connector name="{name}" kind="{kind}">'
+        f"{inner or f'<ssc:Real{attribute}/>'}</ssd:Connector>"
+    )
+
+
+def component(name: str, connectors: str, bindings: str = "", source: str = "") -> str:
+    """A component; its FMU is the one of its name, if no other is given."""
+    source = source or f'source="resources/{name}.fmu"'
+    return (
+        f'<ssd:Component name="{name}" {source}>'
+        f"<ssd:Connectors>{connectors}</ssd:Connectors>{bindings}</ssd:Component>"
+    )
+
+
+def connection(start: str, end: str, inner: str = "", attributes: str = "") -> str:
+    """A connection between ``element.connector``; a connector alone is one of the system."""
+    ends = ""
+    for which, reference in (("start", start), ("end", end)):
+        element, _, name = reference.rpartition(".")
+        if element:
+            ends += f' {which}Element="{element}"'
+        ends += f' {which}Connector="{name}"'
+    return f"<ssd:Connection{ends} {attributes}>{inner}</ssd:Connection>"
+
+
+def system(elements: str, connections: str = "", before: str = "") -> str:
+    """What is in a system; ``before``: its connectors and parameter bindings."""
+    return (
+        f"{before}<ssd:Elements>{elements}</ssd:Elements>"
+        f"<ssd:Connections>{connections}</ssd:Connections>"
+    )
+
+
+def binding(parameters: str, mapping: str = "", attributes: str = "", after: str = "") -> str:
+    """An inline parameter binding."""
+    entries = (
+        f'<ssd:ParameterMapping><ssm:ParameterMapping version="1.0">{mapping}'
+        "</ssm:ParameterMapping></ssd:ParameterMapping>"
+        if mapping
+        else ""
+    )
+    return (
+        f"<ssd:ParameterBinding {attributes}><ssd:ParameterValues>"
+        f"{parameter_set(parameters, after)}</ssd:ParameterValues>{entries}</ssd:ParameterBinding>"
+    )
+
+
+def parameter_set(parameters: str, after: str = "") -> str:
+    """A parameter set without namespaces, which the description has."""
+    return (
+        f'<ssv:ParameterSet version="1.0" name="p"><ssv:Parameters>{parameters}</ssv:Parameters>'
+        f"{after}</ssv:ParameterSet>"
+    )
+
+
+def real(name: str, value: float | str, unit: str = "") -> str:
+    """A parameter of type Real."""
+    attribute = f' unit="{unit}"' if unit else ""
+    return f'<ssv:Parameter name="{name}"><ssv:Real value="{value}"{attribute}/></ssv:Parameter>'
+
+
+def bindings(*each: str) -> str:
+    """The bindings of an element."""
+    return f"<ssd:ParameterBindings>{''.join(each)}</ssd:ParameterBindings>"
+
+
+def linear(factor: float, offset: float) -> str:
+    """A linear transformation."""
+    return f'<ssc:LinearTransformation factor="{factor}" offset="{offset}"/>'
+
+
+INPUTS = connector("x_c", "input") + connector("v_c", "input")
+WHEEL = component("wheel", INPUTS)
+OUTPUTS = connector("x", "output") + connector("v", "output")
+CHASSIS = component("chassis", OUTPUTS)
+
+
+class Packages:
+    """Packages with the FMUs of the quarter car, and how they are read."""
+
+    def __init__(self, folder: Path, fmus: Path) -> None:
+        self.folder = folder
+        self.fmus = fmus
+
+    def write(
+        self, description: str | bytes, name: str = "test.ssp", **files: str | bytes | Path
+    ) -> Path:
+        """A package; two underscores in a name stand for a dot."""
+        path = self.folder / name
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("SystemStructure.ssd", description)
+            for model in ("chassis", "wheel"):
+                archive.write(self.fmus / f"{model}.fmu", f"resources/{model}.fmu")
+            for file, content in files.items():
+                entry = f"resources/{file.replace('__', '.')}"
+                if isinstance(content, Path):
+                    archive.write(content, entry)
+                else:
+                    archive.writestr(entry, content)
+        return path
+
+    def read(self, description: str | bytes, **files: str | bytes | Path) -> ImportedSystem:
+        """What is read of a package."""
+        return self.read_file(self.write(description, **files))
+
+    def read_file(self, path: Path) -> ImportedSystem:
+        """What is read of a file."""
+        scratch = self.folder / f"scratch-{len(list(self.folder.iterdir()))}"
+        scratch.mkdir()
+        return read_ssp(path, scratch)
+
+    def refusal(self, description: str | bytes, **files: str | bytes | Path) -> str:
+        """Why it is refused."""
+        with pytest.raises(ConfigurationError) as caught:
+            self.read(description, **files)
+        return str(caught.value)
+
+
+@pytest.fixture
+def packages(tmp_path: Path, fmu_dir: Path) -> Packages:
+    """A folder for packages."""
+    return Packages(tmp_path, fmu_dir)
+
+
+def tables(read: System) -> dict[str, Any]:
+    """What is set in a system, without the places of its models."""
+    dumped = read.model_dump()
+    for table in dumped["slaves"].values():
+        table["model"] = Path(table["model"]).name
+    return dumped
+
+
+def pairs(read: System) -> list[tuple[str, str]]:
+    """The connections, without transformations."""
+    return [(c.source, c.target) for c in read.connections]
+
+
+def invoke(*arguments: object) -> None:
+    """Run the command line."""
+    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+
+
+@pytest.fixture
+def displacement(fmu_dir: Path) -> Path:
+    """The system file of the quarter car, where its FMUs are."""
+    path = fmu_dir / "displacement.toml"
+    path.write_bytes((EXAMPLES / "displacement.toml").read_bytes())
+    return path
+
+
+# ---- Running, importing, exporting --------------------------------------------------------------
+
+
+def test_a_package_runs_as_the_system_that_it_was_made_of(
+    displacement: Path, tmp_path: Path
+) -> None:
+    """Export, run, and the same run from TOML: equal files, byte for byte."""
+    invoke("export", displacement, "-o", tmp_path / "car.ssp")
+    for name, file in (("ssp", tmp_path / "car.ssp"), ("toml", displacement)):
+        invoke("run", file, "--in-process", "--quiet", "--no-plot", "--output", tmp_path / name)
+    results = [(tmp_path / name / "results.csv").read_bytes() for name in ("ssp", "toml")]
+    assert results[0] == results[1]
+    assert results[0].count(b"\n") > 100
+
+
+def test_the_package_runs_in_processes_of_its_own(
+    quarter_car_ssp: Path, tmp_path: Path, no_process_left: None
+) -> None:
+    """Launched slaves find the extracted models; those are gone afterwards."""
+    arguments = ("--stop-time", "0.1", "--quiet", "--no-plot")
+    for name, more in (("bus", ()), ("here", ("--in-process",))):
+        invoke("run", quarter_car_ssp, *arguments, *more, "--output", tmp_path / name)
+    results = [(tmp_path / name / "results.csv").read_bytes() for name in ("bus", "here")]
+    assert results[0] == results[1]
+    with open_system(quarter_car_ssp) as car:
+        base = car.base
+        assert base.is_dir()
+    assert not base.exists()
+
+
+def test_the_example_is_the_quarter_car(quarter_car_ssp: Path, tmp_path: Path) -> None:
+    """Through a nested system and its connectors, with nothing to be noted."""
+    read = read_ssp(quarter_car_ssp, tmp_path)
+    assert read.notes == ()
+    renamed = {(s.replace("axle.", ""), t.replace("axle.", "")) for s, t in pairs(read.system)}
+    assert renamed == set(DIRECT)
+    assert read.system.slaves["axle.wheel"].parameters == {"z": 0.1}
+    assert (read.system.simulation.start_time, read.system.simulation.stop_time) == (0.0, 4.0)
+
+
+FULL = """
+[simulation]
+start_time = 1
+stop_time = 4.5
+order = 2
+estimator = "rich"
+events = [2.0, 3.0]
+relative_tolerance = 1e-5
+
+[slaves."left.wheel"]
+model = "wheel.fmu"
+parameters = { z = 0.1, m = 40 }
+absolute_tolerance = 1e-3
+tolerances = { x = { relative = 1e-5 } }
+outputs_follow_inputs = true
+
+[slaves.other-wheel]
+model = "wheel.fmu"
+
+[slaves.chassis]
+model = "chassis.fmu"
+largest_step_size = 0.25
+
+[[connections]]
+from = "left.wheel.x"
+to = "chassis.x_w"
+factor = 2.0
+
+[[connections]]
+from = "chassis.x"
+to = "left.wheel.x_c"
+factor = -1.0
+offset = 0.1
+
+[[connections]]
+from = "chassis.x"
+to = "other-wheel.x_c"
+offset = 0.5
+
+[[connections]]
+from = "chassis.v"
+to = "left.wheel.v_c"
+ignore_units = true
+
+[[connections]]
+from = "left.wheel.v"
+to = "chassis.v_w"
+
+[bus]
+listen = ["tcp/127.0.0.1:7450"]
+step_timeout = 5.0
+"""
+
+
+def with_whole_transformations(table: dict[str, Any]) -> dict[str, Any]:
+    """A missing factor is 1 and a missing offset 0 where the other one is given."""
+    for one in table["connections"]:
+        if one["factor"] is not None or one["offset"] is not None:
+            one["factor"] = 1.0 if one["factor"] is None else one["factor"]
+            one["offset"] = one["offset"] or 0.0
+    return table
+
+
+@pytest.fixture
+def full(fmu_dir: Path) -> Path:
+    """A system file that uses all tables."""
+    path = fmu_dir / "full.toml"
+    path.write_text(FULL, encoding="utf-8")
+    return path
+
+
+def test_export_and_import_lose_nothing(full: Path, packages: Packages) -> None:
+    """Every setting comes back; TOML from the package is the same system again."""
+    given = with_whole_transformations(tables(load_system(full)))
+    package = packages.folder / "full.ssp"
+    export_system(full, package)
+    read = packages.read_file(package)
+    assert read.notes == ()
+    assert tables(read.system) == given
+    assert import_system(package, packages.folder / "again.toml") == ()
+    again = load_system(packages.folder / "again.toml")
+    assert tables(again) == given
+    assert {s.model for s in again.slaves.values()} == {
+        "again_models/wheel.fmu",
+        "again_models/chassis.fmu",
+    }
+    for name in ("wheel", "chassis"):
+        copied = packages.folder / "again_models" / f"{name}.fmu"
+        assert copied.read_bytes() == (full.parent / f"{name}.fmu").read_bytes()
+
+
+def test_equal_systems_give_equal_packages(full: Path, tmp_path: Path) -> None:
+    """Nothing in a package depends on when it was written."""
+    contents = []
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        export_system(full, tmp_path / folder / "car.ssp")
+        contents.append((tmp_path / folder / "car.ssp").read_bytes())
+    assert contents[0] == contents[1]
+
+
+def test_exported_documents_keep_the_schemas(full: Path, tmp_path: Path) -> None:
+    """The schemas of SSP 1.0, as FMPy has them; FMPy reads the package too."""
+    package = tmp_path / "full.ssp"
+    export_system(full, package)
+    with zipfile.ZipFile(package) as archive:
+        documents = {n: archive.read(n) for n in archive.namelist() if not n.endswith(".fmu")}
+    assert sorted(documents) == ["SystemStructure.ssd", "resources/left.wheel.ssv"]
+    for name, xml in documents.items():
+        kind = "Description" if name.endswith(".ssd") else "ParameterValues"
+        schema = etree.XMLSchema(file=str(SCHEMAS / f"SystemStructure{kind}.xsd"))
+        schema.assertValid(etree.fromstring(xml))
+    assert len(fmpy.ssp.ssd.read_ssd(str(package)).system.elements) == 3
+
+
+def test_the_documents_of_the_tests_keep_the_schemas_too() -> None:
+    """So what is read here is what other tools write."""
+    schema = etree.XMLSchema(file=str(SCHEMAS / "SystemStructureDescription.xsd"))
+    for text in (NESTED, (EXAMPLES.parent / "ssp" / "SystemStructure.ssd").read_text("utf-8")):
+        schema.assertValid(etree.fromstring(text.encode()))
+
+
+def test_what_is_no_fmu_cannot_be_exported(full: Path, tmp_path: Path) -> None:
+    """Python models and slaves without a model are named, and nothing is written."""
+    for line, told in (('model = "m.py:Wheel"', "'m.py:Wheel'"), ("", "has no FMU")):
+        path = full.parent / "python.toml"
+        path.write_text(f"[slaves.w]\n{line}\n", encoding="utf-8")
+        with pytest.raises(ConfigurationError, match=r"\[slaves\.w\] has no FMU") as caught:
+            export_system(path, tmp_path / "python.ssp")
+        assert told in str(caught.value)
+        assert "export the model as one" in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("parameters = { mm = 1.0 }", "no such variable; did you mean 'm'"),
+        ("parameters = { m = nan }", "is not a finite number"),
+    ],
+)
+def test_parameters_that_cannot_be_exported_are_named(
+    fmu_dir: Path, tmp_path: Path, line: str, told: str
+) -> None:
+    """By slave and name, and no package is left behind."""
+    path = fmu_dir / "wrong.toml"
+    path.write_text(f'[slaves.w]\nmodel = "wheel.fmu"\n{line}\n', encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"\[slaves\.w\.parameters\] 'mm?'") as caught:
+        export_system(path, tmp_path / "wrong.ssp")
+    assert told in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_description_alone_keeps_its_paths(packages: Packages, fmu_dir: Path) -> None:
+    """Without a package the models stay where they are."""
+    path = packages.folder / "car.ssd"
+    path.write_text(ssd(system(WHEEL)), encoding="utf-8")
+    (packages.folder / "resources").mkdir()
+    fmu = packages.folder / "resources" / "wheel.fmu"
+    fmu.write_bytes((fmu_dir / "wheel.fmu").read_bytes())
+    import_system(path, packages.folder / "car.toml")
+    assert load_system(packages.folder / "car.toml").slaves["wheel"].model == "resources/wheel.fmu"
+    (packages.folder / "elsewhere").mkdir()
+    import_system(path, packages.folder / "elsewhere" / "car.toml")
+    moved = load_system(packages.folder / "elsewhere" / "car.toml")
+    assert (moved.base / str(moved.slaves["wheel"].model)).resolve() == fmu.resolve()
+
+
+def test_a_package_cannot_open_the_bus_to_others(full: Path, packages: Packages) -> None:
+    """A package comes from elsewhere: ``insecure`` is for who runs it to say."""
+    text = full.read_text().replace("step_timeout = 5.0", "insecure = true")
+    full.with_name("insecure.toml").write_text(text)
+    export_system(full.with_name("insecure.toml"), packages.folder / "a.ssp")
+    read = packages.read_file(packages.folder / "a.ssp")
+    assert not read.system.bus.insecure
+    assert "[bus] insecure = true is not taken from a package" in read.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('[slaves.wheel]\nmodel = "evil.py:Evil"', "cannot give [slaves.wheel] a model"),
+        ("[slaves.other]\nstep_size = 0.1", "settings of 'other', no slave"),
+        ("[simulation]\nordr = 1", "unknown key 'ordr'; did you mean 'order'"),
+        ("x = 1", "holds more than"),
+        ("[", "is not TOML"),
+    ],
+)
+def test_settings_in_an_annotation_are_checked(packages: Packages, text: str, told: str) -> None:
+    """They cannot name models, nor slaves that are not there, nor keys that do not exist."""
+    annotation = (
+        '<ssd:Annotations><ssc:Annotation type="org.doublestep.system">'
+        f'<d:Settings xmlns:d="urn:doublestep:system">{text}</d:Settings>'
+        "</ssc:Annotation></ssd:Annotations>"
+    )
+    assert told in packages.refusal(ssd(system(WHEEL), annotation))
+
+
+def test_a_broken_import_leaves_no_file(packages: Packages) -> None:
+    """The system file is written when all is known."""
+    path = packages.write(ssd(system(WHEEL + WHEEL)))
+    with pytest.raises(ConfigurationError, match="two elements 'wheel'"):
+        import_system(path, packages.folder / "new" / "car.toml")
+    with pytest.raises(ConfigurationError, match=r"must be a file \.toml"):
+        import_system(path, packages.folder / "car.ssp")
+    assert sorted(p.name for p in packages.folder.iterdir()) == ["test.ssp"]
+
+
+# ---- Nested systems and transformations ---------------------------------------------------------
+
+WHOLE_WHEEL = component("wheel", INPUTS + OUTPUTS)
+WHOLE_CHASSIS = component(
+    "chassis", OUTPUTS + connector("x_w", "input") + connector("v_w", "input")
+)
+PASSED = "".join(
+    connector(name, kind)
+    for name, kind in (("a", "input"), ("b", "input"), ("c", "output"), ("d", "output"))
+)
+
+
+def passing(name: str, inner: str, ports: tuple[str, str, str, str]) -> str:
+    """A system whose connectors a to d pass the signals of one element on.
+
+    Start and end of two of the connections stand against the signal, which SSP allows.
+    """
+    a, b, c, d = ports
+    connections = connection("a", a) + connection(b, "b") + connection(c, "c") + connection("d", d)
+    connectors = f"<ssd:Connectors>{PASSED}</ssd:Connectors>"
+    return f'<ssd:System name="{name}">{system(inner, connections, connectors)}</ssd:System>'
+
+
+INNER = passing("inner", WHOLE_WHEEL, ("wheel.x_c", "wheel.v_c", "wheel.x", "wheel.v"))
+OUTER = passing("outer", INNER, ("inner.a", "inner.b", "inner.c", "inner.d"))
+NESTED = ssd(
+    system(
+        WHOLE_CHASSIS + OUTER,
+        connection("chassis.x", "outer.a")
+        + connection("chassis.v", "outer.b")
+        + connection("outer.c", "chassis.x_w")
+        + connection("outer.d", "chassis.v_w"),
+    )
+)
+
+
+def test_nested_systems_become_connections_of_components(packages: Packages) -> None:
+    """Through two levels, whatever is called start and what end."""
+    read = packages.read(NESTED)
+    assert list(read.system.slaves) == ["chassis", "outer.inner.wheel"]
+    expected = {
+        (s.replace("wheel", "outer.inner.wheel", 1), t.replace("wheel", "outer.inner.wheel", 1))
+        for s, t in DIRECT
+    }
+    assert set(pairs(read.system)) == expected
+    assert len(read.system.connections) == 4
+    assert read.notes == ()
+
+
+def chain(steps: list[tuple[str, str]], units: list[str]) -> str:
+    """chassis.x through one system per inner step to wheel.x_c.
+
+    Args:
+        steps: transformation and attributes of each connection, from the source on.
+        units: of each connector on the way, both ends included.
+    """
+    inner = component("wheel", connector("x_c", "input", units[-1]))
+    target = "wheel.x_c"
+    for number in range(len(steps) - 1, 0, -1):
+        name = f"s{number}"
+        inner = (
+            f'<ssd:System name="{name}">'
+            + system(
+                inner,
+                connection("a", target, *steps[number]),
+                f"<ssd:Connectors>{connector('a', 'input', units[number])}</ssd:Connectors>",
+            )
+            + "</ssd:System>"
+        )
+        target = f"{name}.a"
+    source = component("chassis", connector("x", "output", units[0]))
+    return ssd(system(source + inner, connection("chassis.x", target, *steps[0])))
+
+
+@given(
+    factors=st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=1, max_size=4),
+    value=st.floats(-1e3, 1e3),
+)
+def test_transformations_are_composed(
+    tmp_path_factory: pytest.TempPathFactory,
+    fmu_dir: Path,
+    factors: list[tuple[float, float]],
+    value: float,
+) -> None:
+    """What one connection does is what all on the way do, one after the other."""
+    steps = [(linear(*pair), "") for pair in factors]
+    packages = Packages(tmp_path_factory.mktemp("chain"), fmu_dir)
+    read = packages.read(chain(steps, ["m"] * (len(steps) + 1)))
+    (one,) = read.system.connections
+    expected = value
+    for factor, offset in factors:
+        expected = factor * expected + offset
+    assert one.factor is not None
+    assert one.offset is not None
+    bound = 1e-12 * 1e3 ** (len(factors) + 1)
+    assert one.factor * value + one.offset == pytest.approx(expected, rel=1e-12, abs=bound)
+
+
+SUPPRESSED = 'suppressUnitConversion="true"'
+
+
+@pytest.mark.parametrize(
+    ("steps", "units", "expected"),
+    [
+        ([("", "")], ["m", "m"], (None, None, False)),
+        ([("", "")], ["m", "mm"], (None, None, False)),  # the master converts between FMUs
+        ([("", SUPPRESSED)], ["m", "mm"], (None, None, True)),
+        ([("", ""), ("", "")], ["m", "mm", "m"], (None, None, False)),
+        ([("", SUPPRESSED), ("", SUPPRESSED)], ["m", "mm", "m"], (None, None, True)),
+        ([(linear(2, 5), SUPPRESSED)], ["m", "mm"], (2.0, 5.0, False)),
+        ([(linear(2, 5), "")], ["m", "mm"], (2000.0, 5.0, False)),
+        ([("", ""), (linear(2, 5), "")], ["m", "mm", "m"], (2.0, 5.0, False)),
+        ([(linear(2, 5), ""), ("", "")], ["m", "mm", "m"], (2.0, 0.005, False)),
+        ([("", SUPPRESSED), ("", "")], ["m", "mm", "m"], (0.001, 0.0, False)),
+        ([(linear(2, 5), ""), ("", "")], ["m", "", "mm"], (2000.0, 5000.0, False)),
+    ],
+)
+def test_units_on_the_way(
+    packages: Packages,
+    steps: list[tuple[str, str]],
+    units: list[str],
+    expected: tuple[float | None, float | None, bool],
+) -> None:
+    """Converted before a linear transformation, unless the connection says otherwise."""
+    read = packages.read(chain(steps, units))
+    (one,) = read.system.connections
+    assert (one.factor, one.offset, one.ignore_units) == (
+        pytest.approx(expected[0]) if expected[0] is not None else None,
+        pytest.approx(expected[1]) if expected[1] is not None else None,
+        expected[2],
+    )
+    assert read.notes == ()
+
+
+def test_units_that_are_not_declared_are_noted(packages: Packages) -> None:
+    """A transformation may then stand for too little."""
+    read = packages.read(chain([(linear(2, 5), "")], ["m", ""]))
+    assert "the units of 'x' and 'x_c' are not both declared" in read.notes[0]
+    assert packages.read(chain([(linear(2, 5), SUPPRESSED)], ["m", ""])).notes == ()
+
+
+def test_units_of_other_dimensions_are_refused(packages: Packages) -> None:
+    """A metre is no kilogram."""
+    text = packages.refusal(chain([(linear(2, 5), "")], ["m", "kg"]))
+    assert "unit 'm' cannot be converted to 'kg'" in text
+
+
+@given(
+    numbers=st.tuples(*[st.floats(0.1, 10.0), st.floats(-10.0, 10.0)] * 3), value=st.floats(-10, 10)
+)
+def test_units_are_converted_by_their_base_units(
+    numbers: tuple[float, float, float, float, float, float], value: float
+) -> None:
+    """By way of a third unit it is the same, and the base value stays."""
+    a, b, c = (
+        Unit(name, (0, 1), numbers[2 * i], numbers[2 * i + 1]) for i, name in enumerate("abc")
+    )
+    to_b, to_c, direct = a.to(b), b.to(c), a.to(c)
+    assert to_b is not None
+    assert to_c is not None
+    assert direct is not None
+    assert to_b.then(to_c)(value) == pytest.approx(direct(value), rel=1e-9, abs=1e-9)
+    assert b.factor * to_b(value) + b.offset == pytest.approx(
+        a.factor * value + a.offset, rel=1e-9, abs=1e-9
+    )
+    assert a.to(a) == Linear()
+    assert a.to(Unit("kg", (1, 0), 1.0, 0.0)) is None
+
+
+def test_one_system_can_be_there_twice(packages: Packages, fmu_dir: Path) -> None:
+    """By its id, as a description of its own, and as a package in the package."""
+    inner = passing("inner", WHOLE_WHEEL, ("wheel.x_c", "wheel.v_c", "wheel.x", "wheel.v"))
+    first = inner.replace('<ssd:System name="inner"', '<ssd:System name="inner" id="once"')
+    type_ = 'type="application/x-ssp-definition"'
+    by_id = component("again", PASSED, source=f'{type_} source="#once"')
+    beside = component("beside", PASSED, source=f'{type_} source="resources/sub%20one.ssd"')
+    packed = component(
+        "packed", PASSED, source='type="application/x-ssp-package" source="resources/sub.ssp"'
+    )
+    experiment = '<ssd:DefaultExperiment stopTime="9"/>'
+    apart = ssd(
+        f"<ssd:Connectors>{PASSED}</ssd:Connectors><ssd:Elements>{inner}</ssd:Elements>"
+        "<ssd:Connections>"
+        + "".join(connection(c, f"inner.{c}") for c in "ab")
+        + "".join(connection(f"inner.{c}", c) for c in "cd")
+        + "</ssd:Connections>",
+        experiment,
+    )
+    subpackage = packages.write(apart, "sub.ssp")
+    # A description in resources/ refers to what is beside it.
+    text = apart.replace("resources/wheel.fmu", "wheel.fmu")
+    links = connection("inner.c", "again.a") + connection("again.c", "beside.a")
+    links += connection("beside.c", "packed.a")
+    read = packages.read(
+        ssd(system(first + by_id + beside + packed, links)),
+        **{"sub one__ssd": text, "sub__ssp": subpackage},
+    )
+    assert list(read.system.slaves) == [
+        "inner.wheel",
+        "again.wheel",
+        "beside.inner.wheel",
+        "packed.inner.wheel",
+    ]
+    assert pairs(read.system) == [
+        ("inner.wheel.x", "again.wheel.x_c"),
+        ("again.wheel.x", "beside.inner.wheel.x_c"),
+        ("beside.inner.wheel.x", "packed.inner.wheel.x_c"),
+    ]
+    assert read.system.simulation.stop_time is None
+    assert sum("default experiment" in note for note in read.notes) == 2
+    models = [read.system.base / str(s.model) for s in read.system.slaves.values()]
+    assert all(m.read_bytes() == (fmu_dir / "wheel.fmu").read_bytes() for m in models)
+
+
+def test_a_system_that_refers_to_itself_is_refused(packages: Packages) -> None:
+    """Within a bounded time, by id and by file."""
+    type_ = 'type="application/x-ssp-definition"'
+    by_file = component("me", PASSED, source=f'{type_} source="SystemStructure.ssd"')
+    assert "refers to itself" in packages.refusal(ssd(system(by_file)))
+    by_id = "".join(component(n, PASSED, source=f'{type_} source="#me"') for n in "ab")
+    loop = f'<ssd:System name="s" id="me">{system(by_id)}</ssd:System>'
+    assert "refers to itself" in packages.refusal(ssd(system(loop)))
+
+
+def test_names_that_slaves_cannot_have(packages: Packages) -> None:
+    """Are replaced with a note, or refused where two would become one."""
+    source = 'source="resources/wheel.fmu"'
+    read = packages.read(ssd(system(component("my wheel", INPUTS, source=source))))
+    assert list(read.system.slaves) == ["my_wheel"]
+    assert "'my wheel' is called 'my_wheel' here" in read.notes[0]
+    two = component("my wheel", INPUTS, source=source) + component("my_wheel", "", source=source)
+    two = two.replace("<ssd:Connectors></ssd:Connectors>", "")
+    assert "two components get the name 'my_wheel'" in packages.refusal(ssd(system(two)))
+
+
+# ---- Parameters ---------------------------------------------------------------------------------
+
+
+def test_parameters_by_name_prefix_and_level(packages: Packages) -> None:
+    """Files and inline, on components and systems: the outermost and the last one win."""
+    inner = component(
+        "wheel",
+        INPUTS + connector("z", "parameter"),
+        bindings(binding(real("m", 1) + real("k_w", 1) + real("x", 1) + real("v", 1))),
+    )
+    road = "<ssd:Connectors>" + connector("road", "parameter") + "</ssd:Connectors>"
+    axle = (
+        '<ssd:System name="axle">'
+        + system(
+            inner,
+            connection("road", "wheel.z"),
+            road
+            + bindings(
+                binding(real("wheel.k_w", 2) + real("wheel.x", 2) + real("wheel.v", 2)),
+                binding(real("x", 3) + real("v", 3), attributes='prefix="wheel."'),
+            ),
+        )
+        + "</ssd:System>"
+    )
+    root = bindings(
+        '<ssd:ParameterBinding source="resources/a.ssv" prefix="axle."/>',
+    )
+    values = parameter_set(real("wheel.v", 4) + real("road", 0.25)).replace(
+        "<ssv:ParameterSet", f"<ssv:ParameterSet{NAMESPACES}"
+    )
+    read = packages.read(ssd(system(axle, before=root)), a__ssv=values)
+    assert read.system.slaves["axle.wheel"].parameters == {
+        "m": 1.0,
+        "k_w": 2.0,
+        "x": 3.0,
+        "v": 4.0,
+        "z": 0.25,
+    }
+    assert read.notes == ()
+
+
+def entry(source: str, target: str, inner: str = "") -> str:
+    """A mapping entry."""
+    return f'<ssm:MappingEntry source="{source}" target="{target}">{inner}</ssm:MappingEntry>'
+
+
+def test_parameters_are_mapped_and_transformed(packages: Packages) -> None:
+    """Only what is mapped is applied, one source to several targets."""
+    mapping = (
+        entry("mass", "m", linear(1000, 5))
+        + entry("mass", "k_w")
+        + entry("gone", "c")
+        + entry(
+            "flag",
+            "z",
+            '<ssc:IntegerMappingTransformation><ssc:MapEntry source="1" '
+            'target="7"/></ssc:IntegerMappingTransformation>',
+        )
+    )
+    values = (
+        real("mass", 0.04)
+        + '<ssv:Parameter name="flag"><ssv:Integer value="1"/></ssv:Parameter>'
+        + real("other", 1)
+    )
+    text = ssd(system(component("wheel", INPUTS, bindings(binding(values, mapping)))))
+    read = packages.read(text)
+    assert read.system.slaves["wheel"].parameters == {"m": 45.0, "k_w": 0.04, "z": 7}
+    assert "no parameter 'gone' is there to be mapped" in read.notes[0]
+    assert "not mapped, so not applied: 'other'" in read.notes[1]
+    file = (
+        f'<ssm:ParameterMapping{NAMESPACES} version="2.0">{entry("mass", "m")}'
+        "</ssm:ParameterMapping>"
+    )
+    inline = binding(values, entry("mass", "m"))
+    start, end = inline.index("<ssd:ParameterMapping>"), inline.index("</ssd:ParameterBinding>")
+    by_file = inline[:start] + '<ssd:ParameterMapping source="resources/m.ssm"/>' + inline[end:]
+    read = packages.read(ssd(system(component("wheel", INPUTS, bindings(by_file)))), m__ssm=file)
+    assert read.system.slaves["wheel"].parameters == {"m": 0.04}
+
+
+def test_parameters_pass_connectors_with_their_transformations(packages: Packages) -> None:
+    """A value for a connector reaches every variable behind it, converted and transformed."""
+    inside = (
+        '<ssd:System name="axle"><ssd:Connectors>'
+        + connector("height", "parameter", "mm")
+        + connector("push", "input")
+        + "</ssd:Connectors><ssd:Elements>"
+        + component("wheel", connector("z", "parameter", "m") + INPUTS)
+        + "</ssd:Elements><ssd:Connections>"
+        + connection("height", "wheel.z", linear(2, 1))
+        + connection("push", "wheel.x_c")
+        + "</ssd:Connections></ssd:System>"
+    )
+    outside = (
+        "<ssd:Connectors>"
+        + connector("push", "input")
+        + connector("free", "input")
+        + "</ssd:Connectors>"
+        + bindings(binding(real("axle.height", 100, "mm") + real("push", 0.5)))
+    )
+    read = packages.read(
+        ssd(system(inside, connection("push", "axle.push"), outside)).replace(
+            "</ssv:Parameters>",
+            '</ssv:Parameters><ssv:Units><ssc:Unit name="mm"><ssc:BaseUnit '
+            'm="1" factor="0.001"/></ssc:Unit></ssv:Units>',
+        )
+    )
+    parameters = read.system.slaves["axle.wheel"].parameters
+    assert parameters == {"z": pytest.approx(1.2), "x_c": 0.5}
+    assert read.notes == ()
+
+
+def test_what_does_not_fit_is_noted(packages: Packages) -> None:
+    """Names that nothing has, another unit, and inputs of the whole system."""
+    values = real("m", 40000, "g") + real("mass", 1)
+    whole = "<ssd:Connectors>" + connector("u", "input") + "</ssd:Connectors>"
+    read = packages.read(
+        ssd(
+            system(
+                component("wheel", INPUTS, bindings(binding(values))),
+                connection("u", "wheel.x_c"),
+                whole,
+            )
+        )
+    )
+    assert read.system.slaves["wheel"].parameters == {"m": 40000.0}
+    assert "the value for wheel.m has the unit 'g', the variable 'kg'" in read.notes[0]
+    assert "no variable of 'wheel' has the name 'mass'; not applied" in read.notes[1]
+    assert "inputs of the whole system 'u': nothing drives them" in read.notes[2]
+    assert read.system.connections == ()
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ('<ssv:Float32 value=" 2.5 "/>', 2.5),
+        ('<ssv:UInt16 value="7"/>', 7),
+        ('<ssv:Boolean value="1"/>', True),
+        ('<ssv:String value="a b"/>', "a b"),
+        ("<ssv:String><ssv:Value>a</ssv:Value></ssv:String>", "a"),
+        ('<ssv:Enumeration value="on" name="switch"/>', 3),
+    ],
+)
+def test_types_of_values(packages: Packages, value: str, expected: object) -> None:
+    """Those of SSP 1.0 and 2.0, with their types."""
+    after = (
+        '<ssv:Enumerations><ssc:Enumeration name="switch"><ssc:Item name="on" value="3"/>'
+        "</ssc:Enumeration></ssv:Enumerations>"
+    )
+    text = binding(f'<ssv:Parameter name="m">{value}</ssv:Parameter>', after=after)
+    read = packages.read(ssd(system(component("wheel", INPUTS, bindings(text)))))
+    given_value = read.system.slaves["wheel"].parameters["m"]
+    assert given_value == expected
+    assert type(given_value) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        ('<ssv:Real value="NaN"/>', "'NaN' is not a finite number"),
+        ('<ssv:Real value="INF"/>', "'INF' is not a finite number"),
+        ('<ssv:Real value="1_0"/>', "'1_0' is not a finite number"),
+        ('<ssv:Real value=""/>', "'value' is missing"),
+        ('<ssv:Integer value="1.5"/>', "'1.5' is not a whole number"),
+        ('<ssv:Boolean value="yes"/>', "'yes' is neither true nor false"),
+        ('<ssv:Binary value="00"/>', "a Binary value"),
+        ('<ssv:Enumeration value="on"/>', "Enumeration item 'on' has no number"),
+        ('<ssv:Real value="1 2"/><ssc:Dimension size="2"/>', "an array"),
+        ('<ssv:Real value="1"/><ssv:Integer value="1"/>', "needs one element"),
+        ('<ssv:Complex value="1"/>', "needs one element"),
+    ],
+)
+def test_values_that_cannot_be_used_are_named(packages: Packages, value: str, told: str) -> None:
+    """With file and line."""
+    text = binding(f'<ssv:Parameter name="m">{value}</ssv:Parameter>')
+    refused = packages.refusal(ssd(system(component("wheel", INPUTS, bindings(text)))))
+    assert told in refused
+    assert "SystemStructure.ssd, line 3" in refused
+
+
+# ---- What is not supported is named -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("description", "told"),
+    [
+        (ssd(system(WHEEL), version="Draft20180219"), "version 'Draft20180219' is not known"),
+        (ssd(system(WHEEL)).replace("SSP1", "SSP0"), "the root is"),
+        (ssd("<ssd:Strange/>"), "ssd:Strange: is not supported in ssd:System"),
+        (
+            ssd(system(component("wheel", INPUTS, source='type="text/x-modelica" source="a.mo"'))),
+            "of type 'text/x-modelica' is not supported",
+        ),
+        (ssd(system(component("wheel", INPUTS, source=" "))), "component 'wheel' has no source"),
+        (
+            ssd(system(component("wheel", INPUTS, source='source="resources/evil.py:Evil"'))),
+            "leads outside the folder",
+        ),
+        (
+            ssd(system(component("wheel", INPUTS, source='source="resources/evil.py"'))),
+            "is not an .fmu file",
+        ),
+        (
+            ssd(system(component("wheel", INPUTS, source='source="resources/gone.fmu"'))),
+            "resources/gone.fmu: no such file",
+        ),
+        (
+            ssd(system(component("wheel", INPUTS, source='source="../../wheel.fmu"'))),
+            "leads outside the folder",
+        ),
+        (
+            ssd(system(component("wheel", INPUTS, source='source="/etc/wheel.fmu"'))),
+            "leads outside the folder",
+        ),
+        (
+            ssd(system(component("wheel", INPUTS, source='source="%2e%2e/wheel.fmu"'))),
+            "leads outside the folder",
+        ),
+        (
+            ssd(system(component("wheel", INPUTS, source='source="http://a/wheel.fmu"'))),
+            "is not a relative URI",
+        ),
+        (
+            ssd(system(WHEEL.replace("<ssd:Component", '<ssd:Component implementation="X"'))),
+            "implementation 'X' is not supported",
+        ),
+        (
+            ssd(system(WHEEL + '<ssd:SignalDictionaryReference name="b" dictionary="d"/>')),
+            "signal dictionaries are not supported",
+        ),
+        (
+            ssd(system(component("wheel", connector("x_c", "sideways")))),
+            "kind 'sideways' is not known",
+        ),
+        (
+            ssd(system(component("wheel", connector("x_c", "input", "furlong")))),
+            "unit 'furlong' is not in ssd:Units",
+        ),
+    ],
+)
+def test_what_is_not_supported_is_refused_by_name(
+    packages: Packages, description: str, told: str
+) -> None:
+    """With file and line; nothing is left out without a word."""
+    refused = packages.refusal(description)
+    assert told in refused
+    assert "test.ssp/SystemStructure.ssd, line " in refused
+
+
+MAPPED = (
+    '<ssc:BooleanMappingTransformation><ssc:MapEntry source="true" target="false"/>'
+    "</ssc:BooleanMappingTransformation>"
+)
+ENUMERATED = (
+    '<ssc:EnumerationMappingTransformation><ssc:MapEntry source="a" target="b"/>'
+    "</ssc:EnumerationMappingTransformation>"
+)
+
+
+@pytest.mark.parametrize(
+    ("connections", "told"),
+    [
+        (connection("chassis.x", "wheel.x_c", MAPPED), "a mapping transformation of a connection"),
+        (
+            connection("chassis.x", "wheel.x_c", ENUMERATED),
+            "ssc:EnumerationMappingTransformation of a connection is not supported",
+        ),
+        (connection("chassis.x", "chassis.v"), "has no direction"),
+        (connection("chassis.x", "whel.x_c"), "no element 'whel'; did you mean 'wheel'?"),
+        (connection("chassis.x", "wheel.x_d"), "no connector 'x_d'; did you mean 'x_c'?"),
+        (
+            connection("chassis.x", "wheel.x_c") + connection("chassis.v", "wheel.x_c"),
+            "connector 'x_c' has two sources",
+        ),
+        (
+            connection("chassis.x", "wheel.x_c", attributes='startIndices="1"'),
+            "elements of arrays cannot be connected",
+        ),
+        (connection("chassis.x", "wheel.array"), "cannot be connected: an array"),
+        (connection("chassis.x", "wheel.binary"), "cannot be connected: type ssc:Binary"),
+        (connection("chassis.x", "wheel.clocked"), "cannot be connected: a clock"),
+        (connection("chassis.x", "wheel.any"), "cannot be connected: kind unspecified"),
+        (connection("chassis.k", "wheel.x_c"), "from kind 'constant' to kind 'input'"),
+        (connection("chassis.x", "wheel.z"), "from kind 'output' to kind 'parameter'"),
+        (
+            connection("s.out", "s.in"),
+            "leads through systems back to itself",
+        ),
+    ],
+)
+def test_connections_that_are_not_supported_are_refused_by_name(
+    packages: Packages, connections: str, told: str
+) -> None:
+    """With file and line."""
+    wheel = component(
+        "wheel",
+        INPUTS
+        + connector("array", "input", inner='<ssc:Real/><ssc:Dimension size="2"/>')
+        + connector("binary", "input", inner="<ssc:Binary/>")
+        + connector("clocked", "input", inner='<ssc:Real/><ssc:Clock name="c"/>')
+        + connector("any", "unspecified")
+        + connector("z", "parameter"),
+    )
+    chassis = component("chassis", OUTPUTS + connector("k", "constant"))
+    looped = (
+        '<ssd:System name="s"><ssd:Connectors>'
+        + connector("in", "input")
+        + connector("out", "output")
+        + "</ssd:Connectors><ssd:Elements>"
+        + WHEEL
+        + "</ssd:Elements><ssd:Connections>"
+        + connection("in", "out")
+        + connection("in", "wheel.x_c")
+        + "</ssd:Connections></ssd:System>"
+    )
+    refused = packages.refusal(ssd(system(wheel + chassis + looped, connections)))
+    assert told in refused
+    assert "SystemStructure.ssd, line " in refused
+
+
+@pytest.mark.parametrize(
+    ("inner", "told"),
+    [
+        ('<ssd:ParameterBinding type="text/csv" source="a.csv"/>', "type 'text/csv'"),
+        ('<ssd:ParameterBinding source="a.ssv" sourceBase="component"/>', "sourceBase"),
+        ('<ssd:ParameterBinding source="../a.ssv"/>', "leads outside"),
+        ('<ssd:ParameterBinding source="a.ssv"/>', "a.ssv: cannot be read"),
+        ("<ssd:ParameterBinding/>", "has neither a source nor an ssv:ParameterSet"),
+        (binding(real("m", 1) + real("m", 2)), "'m' is there twice"),
+        (binding(real("m", 1), entry("m", "z") + entry("m", "z")), "are mapped to 'z'"),
+        (binding(real("m", 1), entry("m", "z", ENUMERATED)), "Enumeration"),
+        (binding(real("m", 1), entry("m", "z", MAPPED)), "no MapEntry for the value 1.0"),
+    ],
+)
+def test_bindings_that_are_not_supported_are_refused_by_name(
+    packages: Packages, inner: str, told: str
+) -> None:
+    """With file and line."""
+    refused = packages.refusal(ssd(system(component("wheel", INPUTS, bindings(inner)))))
+    assert told in refused
+
+
+def test_what_has_no_influence_is_noted_in_one_sentence(packages: Packages) -> None:
+    """Geometry, other tools' annotations, descriptions, what a package holds beside."""
+    geometry = '<ssd:ConnectorGeometry x="0" y="0.5"/>'
+    wheel = component(
+        "wheel",
+        connector("x_c", "input", inner=f"<ssc:Real/>{geometry}")
+        + connector("v_c", "input", inner=f"<ssc:Real/>{geometry}"),
+    ).replace("<ssd:Component", '<ssd:Component strange="1" description="a wheel"')
+    annotations = (
+        '<ssd:Annotations><ssc:Annotation type="com.example"><x xmlns="urn:x"/></ssc:Annotation>'
+        "</ssd:Annotations>"
+    )
+    path = packages.write(ssd(system(wheel), annotations))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("extra/com.example/a.txt", "a")
+        archive.writestr("Variant.ssd", "")
+        archive.writestr("documentation/index.html", "")
+    read = packages.read_file(path)
+    *notes, last = read.notes
+    assert last.endswith(
+        "not carried, as it has no influence here: annotation com.example, "
+        "ssd:ConnectorGeometry (2 times), description"
+    )
+    assert any("attribute 'strange' is not carried" in note for note in notes)
+    assert any("'extra/com.example/a.txt' is not carried" in note for note in notes)
+    assert any("variants beside SystemStructure.ssd: 'Variant.ssd'" in note for note in notes)
+    assert len(notes) == 3
+
+
+def test_notes_are_shown_at_the_prompt(
+    packages: Packages, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Both by a run and by an import."""
+    values = bindings(binding(real("mass", 1)))
+    path = packages.write(
+        ssd(system(component("wheel", INPUTS, values)), '<ssd:DefaultExperiment stopTime="0.1"/>')
+    )
+    invoke("run", path, "--in-process", "--quiet", "--no-plot", "--output", packages.folder / "r")
+    invoke("import", path)
+    told = [r.message for r in caplog.records if "has the name 'mass'" in r.message]
+    assert len(told) == 2
+    assert tomllib.loads((packages.folder / "test.toml").read_text())["simulation"] == {
+        "stop_time": 0.1
+    }
+
+
+# ---- Hostile packages ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["../evil", "resources/../../evil", "/evil", "C:/evil"])
+def test_names_that_lead_outside_are_refused(packages: Packages, name: str) -> None:
+    """By name, before anything is extracted."""
+    path = packages.write(ssd(system(WHEEL)))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(name, b"evil")
+    scratch = packages.folder / "scratch"
+    scratch.mkdir()
+    with pytest.raises(ModelError, match="leads outside the archive"):
+        read_ssp(path, scratch)
+    assert list(scratch.iterdir()) == []
+
+
+def test_links_and_bombs_are_refused(packages: Packages) -> None:
+    """A link could lead a later entry anywhere; zeros could fill the disk."""
+    path = packages.write(ssd(system(WHEEL)))
+    link = zipfile.ZipInfo("resources/link")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(link, "/etc")
+    with pytest.raises(ModelError, match="is a symbolic link"):
+        packages.read_file(path)
+    with pytest.raises(ModelError, match="unpacks to 100000000 bytes"):
+        packages.read(ssd(system(WHEEL)), zeros=bytes(100_000_000))
+
+
+BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]>'
+
+
+def test_document_types_are_refused(packages: Packages) -> None:
+    """In descriptions, parameter sets and mappings, whatever the encoding."""
+    text = ssd(system(WHEEL))
+    for encoding in ("utf-8", "utf-16", "iso-8859-1"):
+        head = f'<?xml version="1.0" encoding="{encoding}"?>'
+        refused = packages.refusal(f"{head}{BOMB}{text}".encode(encoding))
+        assert "SystemStructure.ssd declares a document type" in refused
+    by_file = bindings('<ssd:ParameterBinding source="resources/a.ssv"/>')
+    text = ssd(system(component("wheel", INPUTS, by_file)))
+    assert "a.ssv declares a document type" in packages.refusal(text, a__ssv=f"{BOMB}<x/>")
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 but not more", b"<x/>"])
+def test_what_is_no_package_is_refused(packages: Packages, content: bytes) -> None:
+    """With what to do."""
+    path = packages.folder / "broken.ssp"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=r"broken\.ssp: not a readable SSP archive"):
+        packages.read_file(path)
+    with pytest.raises(ModelError, match="no such file"):
+        packages.read_file(packages.folder / "gone.ssp")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.txt", "")
+    with pytest.raises(ModelError, match=r"holds no SystemStructure\.ssd"):
+        packages.read_file(path)
+
+
+def test_a_package_without_end_is_refused(packages: Packages) -> None:
+    """Packages in packages are extracted to a bounded depth and number."""
+    source = 'type="application/x-ssp-package" source="resources/sub.ssp"'
+    text = ssd(system("".join(component(n, PASSED, source=source) for n in "ab")))
+    path = packages.write(ssd(system(WHEEL)), "p0.ssp")
+    for depth in range(1, 8):
+        path = packages.write(text, f"p{depth}.ssp", sub__ssp=path)
+    with pytest.raises(ConfigurationError, match="more than 100 packages"):
+        packages.read_file(path)
