@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import in_process, memory, over_zenoh
+from benchmarks import in_process, memory, over_zenoh, saved_states
 
 TABLES = {
     "over_zenoh": (
@@ -14,6 +14,11 @@ TABLES = {
         "Attempted double step in process",
         ("configuration", "attempted double step", "by hand with FMPy", "ratio"),
         in_process.run,
+    ),
+    "saved_states": (
+        "States saved by forking and natively",
+        ("what", "fork", "native", "ratio"),
+        saved_states.run,
     ),
     "memory": (
         "Resident memory over a million attempted double steps",
