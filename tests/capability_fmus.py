@@ -6,7 +6,7 @@ One class for every interface; all address variables by name and count on a stat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from ctypes import POINTER, byref, c_char, c_double, c_int, c_size_t, c_uint, c_void_p
+from ctypes import POINTER, c_char, c_double, c_int, c_size_t, c_uint, c_void_p
 from pathlib import Path
 from typing import Any
 
@@ -265,20 +265,3 @@ def set_states(model: Model2 | Model3, time: float, x: np.ndarray) -> None:
     """Set the time and the continuous states of a model in continuous-time mode."""
     model.fmu.setTime(time)
     model.fmu.setContinuousStates((c_double * len(x))(*x), len(x))
-
-
-__all__ = [
-    "DISCARD",
-    "ERROR",
-    "OK",
-    "WARNING",
-    "Extracted",
-    "Model2",
-    "Model3",
-    "Slave1",
-    "Slave2",
-    "Slave3",
-    "byref",
-    "set_states",
-    "vector",
-]

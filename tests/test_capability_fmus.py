@@ -37,6 +37,8 @@ from tests.capability_fmus import (
     vector,
 )
 
+pytestmark = pytest.mark.timeout(300)  # the first test builds all of them
+
 HALVES = ("chassis", "wheel")
 STEPS = (0.01, 0.003, 0.02, 0.0007)
 

@@ -18,7 +18,7 @@ from master_node.cli import main
 from master_node.configure_slaves import configure
 from master_node.slave_link import LocalSlave
 from protocol.calls import Configure, Describe
-from protocol.errors import ConfigurationError, ModelError, SlaveError
+from protocol.errors import ModelError, SlaveError
 from protocol.slave import SlaveDescription, StateKind
 from slave_node.executor import Executor
 from slave_node.loading import describe_model, load_executor, load_slave
@@ -206,12 +206,11 @@ def test_a_wish_that_cannot_be_met_names_the_slave(capability_dir: Path) -> None
         simulate(system, in_process=True)
 
 
-def test_without_states_steps_are_not_controlled(tmp_path: Path) -> None:
-    """An estimator needs them; a fixed step does not."""
-    system = car(stop_time=0.1).with_slaves(state="none")
-    with pytest.raises(ConfigurationError, match=r"state cannot be saved.*asks for it"):
-        simulate(system, in_process=True)
-    assert simulate(system, in_process=True, estimator="none").time[-1] == pytest.approx(0.1)
+def test_without_states_nothing_is_taken_back() -> None:
+    """The master hears it from the slaves, and controls the steps in another way."""
+    summary = simulate(car(stop_time=0.1).with_slaves(state="none"), in_process=True).summary
+    assert set(summary["state_kind"].values()) == {"none"}
+    assert set(summary["rollbacks"].values()) == {0}
 
 
 def test_the_command_line_chooses_for_all_slaves(

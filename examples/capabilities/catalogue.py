@@ -207,7 +207,7 @@ def quarter_car() -> Iterator[Fmu]:
         description = read_description(path / "modelDescription.xml")
         for variant, (version, capabilities) in variants.items():
             described = replace(description, name=f"{half}_{variant}")
-            definitions = {}
+            definitions: dict[str, str] = {}
             if variant == "fmi3_intermediate":
                 definitions["INTERNAL_STEP"] = "0.001"
                 described = with_variables(
@@ -288,24 +288,23 @@ def lags() -> Iterator[Fmu]:
     whole = LAG_CAPABILITIES
     held = replace(whole, input_derivatives=0, output_derivatives=0)
     no_state = replace(whole, saved_states=False)
-    for name, description, capabilities, definitions in (
-        ("broken_state", "A lag that does not restore its state", whole, {}),
-        ("restarting_solver", "A lag whose solver restarts with a restored state", whole, {}),
-        ("not_repeating", "A lag whose steps do not repeat", held, {}),
-        ("error_on_restore", "A lag that refuses to restore its state", whole, {}),
-        ("starts_thread", "A lag with a thread of its own", no_state, {}),
-        ("writes_file", "A lag that writes a file", no_state, {}),
-        ("discards", "A lag that takes no step longer than 2 ms", whole, {}),
-        ("large_state", "131 072 lags, 1 MiB of state", whole, {}),
-        ("internal_clock", "A lag that moves every 10 ms", held, {}),
-        ("euler_per_step", "A lag, one explicit Euler step per communication step", held, {}),
-        ("licence_error", "A lag that needs a licence", whole, {}),
+    for name, description, capabilities in (
+        ("broken_state", "A lag that does not restore its state", whole),
+        ("restarting_solver", "A lag whose solver restarts with a restored state", whole),
+        ("not_repeating", "A lag whose steps do not repeat", held),
+        ("error_on_restore", "A lag that refuses to restore its state", whole),
+        ("starts_thread", "A lag with a thread of its own", no_state),
+        ("writes_file", "A lag that writes a file", no_state),
+        ("discards", "A lag that takes no step longer than 2 ms", whole),
+        ("large_state", "131 072 lags, 1 MiB of state", whole),
+        ("internal_clock", "A lag that moves every 10 ms", held),
+        ("euler_per_step", "A lag, one explicit Euler step per communication step", held),
+        ("licence_error", "A lag that needs a licence", whole),
     ):
         yield make_fmu(
             lag_description(name, description),
             (*LAG, SOURCES / f"{name}.c"),
             capabilities=capabilities,
-            definitions=definitions,
             libraries=("-pthread",) if name == "starts_thread" else (),
             documents={"resources/README.txt": b"steps.txt appears here.\n"}
             if name == "writes_file"
@@ -523,10 +522,9 @@ OUT = 100
 
 def all_types2() -> Fmu:
     """Every type of FMI 2.0."""
-    discrete = {"variability": "discrete"}
     pairs = (
         Variable("real_continuous", 0, "", start="0"),
-        Variable("real_discrete", 1, "", start="0", **discrete),
+        Variable("real_discrete", 1, "", start="0", variability="discrete"),
         Variable("integer", 2, "", "Int32", start="0"),
         Variable("boolean", 3, "", "Boolean", start="false"),
         Variable("string", 4, "", "String", start=""),

@@ -42,7 +42,6 @@ class Variable:
     variability: str | None = None
     initial: str | None = None
     unit: str | None = None
-    display_unit: str | None = None
     description: str | None = None
     derivative: str | None = None
     """Of which variable it is the derivative."""
@@ -77,7 +76,6 @@ class Unit:
 
     name: str
     base: dict[str, str]
-    display_units: tuple[tuple[str, dict[str, str]], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -206,7 +204,7 @@ def fmi2(description: Description, kind: str = "CoSimulation") -> bytes:
         variableNamingConvention="structured",
         numberOfEventIndicators=str(len(description.event_indicators)),
     )
-    ET.SubElement(root, kind, modelIdentifier=description.name, **description.capabilities)
+    ET.SubElement(root, kind, {"modelIdentifier": description.name} | description.capabilities)
     _write_units(root, description.units)
     if description.enumerations:
         types = ET.SubElement(root, "TypeDefinitions")
@@ -239,7 +237,6 @@ def fmi2(description: Description, kind: str = "CoSimulation") -> bytes:
             _present(
                 declaredType=variable.declared_type,
                 unit=variable.unit,
-                displayUnit=variable.display_unit,
                 start=variable.start,
                 derivative=derivative,
             )
@@ -281,7 +278,7 @@ def fmi3(description: Description, kind: str = "CoSimulation") -> bytes:
         description=description.description,
         variableNamingConvention="structured",
     )
-    ET.SubElement(root, kind, modelIdentifier=description.name, **description.capabilities)
+    ET.SubElement(root, kind, {"modelIdentifier": description.name} | description.capabilities)
     _write_units(root, description.units)
     if description.enumerations:
         types = ET.SubElement(root, "TypeDefinitions")
@@ -316,7 +313,6 @@ def fmi3(description: Description, kind: str = "CoSimulation") -> bytes:
                 description=variable.description,
                 declaredType=variable.declared_type,
                 unit=variable.unit,
-                displayUnit=variable.display_unit,
                 derivative=reference[variable.derivative] if variable.derivative else None,
                 start=None if texts else variable.start,
             )
@@ -413,8 +409,6 @@ def _write_units(root: ET.Element, units: tuple[Unit, ...]) -> None:
     for unit in units:
         element = ET.SubElement(definitions, "Unit", name=unit.name)
         ET.SubElement(element, "BaseUnit", unit.base)
-        for name, conversion in unit.display_units:
-            ET.SubElement(element, "DisplayUnit", name=name, **conversion)
 
 
 def _write_items(element: ET.Element, items: tuple[str, ...]) -> None:
@@ -439,4 +433,4 @@ def _present(**attributes: str | None) -> dict[str, str]:
 
 def _text(root: ET.Element) -> bytes:
     ET.indent(root)
-    return ET.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
+    return bytes(ET.tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"

@@ -182,11 +182,17 @@ fmi3Status fmi3SetString(fmi3Instance c, const fmi3ValueReference valueReference
                                  nValues));
 }
 
-static bool count_fits(Instance *instance, const char *function, size_t n, size_t expected)
+static bool binaries_fit(Instance *instance, const char *function,
+                         const fmi3ValueReference reference[], size_t expected,
+                         const size_t sizes[], const fmi3Binary values[], size_t n)
 {
     if (n != expected)
         report(instance, ERROR, function, "%zu values for %zu scalar variables", n, expected);
-    return n == expected;
+    else if (n && !(reference && sizes && values))
+        report(instance, ERROR, function, "an argument is NULL");
+    else
+        return true;
+    return false;
 }
 
 fmi3Status fmi3GetBinary(fmi3Instance c, const fmi3ValueReference valueReferences[],
@@ -194,7 +200,8 @@ fmi3Status fmi3GetBinary(fmi3Instance c, const fmi3ValueReference valueReference
                          size_t nValues)
 {
     Instance *instance = enter(c, __func__, CAN_GET);
-    if (!instance || !count_fits(instance, __func__, nValues, nValueReferences))
+    if (!instance || !binaries_fit(instance, __func__, valueReferences, nValueReferences,
+                                   valueSizes, values, nValues))
         return fmi3Error;
     if (behaviour.calculate && instance->standing.mode != INSTANTIATED)
         behaviour.calculate(instance->state, instance->standing.time);
@@ -214,7 +221,9 @@ fmi3Status fmi3SetBinary(fmi3Instance c, const fmi3ValueReference valueReference
                          const fmi3Binary values[], size_t nValues)
 {
     Instance *instance = enter(c, __func__, CAN_SET);
-    if (!instance || !count_fits(instance, __func__, nValues, nValueReferences) ||
+    if (!instance ||
+        !binaries_fit(instance, __func__, valueReferences, nValueReferences, valueSizes, values,
+                      nValues) ||
         !may_be_set(instance, __func__, valueReferences, nValueReferences))
         return fmi3Error;
     for (size_t i = 0; i < nValueReferences; ++i) {
