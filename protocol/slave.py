@@ -160,8 +160,9 @@ class Capabilities:
 
     Attributes:
         outputs_follow_inputs: outputs read after ``set_inputs``, without a step in between, belong
-            to the new inputs. FMI 2.0 does not let a master ask for that (section 4.2.4), so an
-            FMU has it only by the word of its user; Python models have it.
+            to the new inputs. FMI 2.0 does not let a master ask for that (section 4.2.4), so a
+            co-simulation FMU has it only by the word of its user; model exchange and Python models
+            have it.
     """
 
     can_get_and_set_state: bool = False
