@@ -42,9 +42,13 @@ def loaded(
 
 
 def begin(
-    slave: Slave, inputs: tuple[str, ...], outputs: tuple[str, ...], **start_values: object
+    slave: Slave,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    discrete: tuple[tuple[str, ...], tuple[str, ...]] = ((), ()),
+    **start_values: object,
 ) -> None:
-    """From instantiated to t = 0."""
+    """From instantiated to t = 0; ``discrete`` inputs and outputs."""
     slave.initialize(
         start_time=0.0,
         stop_time=None,
@@ -52,6 +56,8 @@ def begin(
         start_values=start_values,  # type: ignore[arg-type]
         inputs=inputs,
         outputs=outputs,
+        discrete_inputs=discrete[0],
+        discrete_outputs=discrete[1],
     )
     slave.exit_initialization_mode()
 

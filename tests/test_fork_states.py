@@ -35,7 +35,7 @@ from protocol.errors import (
     SlaveError,
     StepRejectedError,
 )
-from protocol.slave import Slave, StateKind, StepStatus
+from protocol.slave import Causality, Slave, SlaveDescription, StateKind, StepStatus, VariableType
 from slave_node.examination import examine
 from slave_node.worker import ModelReference, WorkerProcess
 from tests.quarter_car_case import DISPLACEMENT
@@ -146,6 +146,53 @@ def test_fmus_that_cannot_save_their_state_are_controlled_all_the_same(
         system = car(capability_dir, None, f"chassis_{variant}", f"wheel_{variant}")
         files.append(results(system, tmp_path / variant, kind, in_process=True))
     assert files[0] == files[1]
+
+
+def _names(
+    described: SlaveDescription, causality: Causality
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Continuous and discrete variables; clocks are not exchanged."""
+    variables = [v for v in described.of(causality) if v.type is not VariableType.CLOCK]
+    return (
+        tuple(v.name for v in variables if v.is_continuous_real),
+        tuple(v.name for v in variables if not v.is_continuous_real),
+    )
+
+
+@pytest.mark.parametrize(
+    "fmu", ["all_types2", "all_types3", "wheel_fmi1", "wheel_fmi3_bare", "wheel_me2", "event_mode3"]
+)
+def test_every_kind_of_fmu_and_value_is_forked_and_replayed(capability_dir: Path, fmu: str) -> None:
+    """With values of all types that change with time, forth and back, the same outputs."""
+    seen = []
+    for kind in ("fork", "replay"):
+        with loaded(capability_dir / f"{fmu}.fmu", kind) as slave:
+            described = slave.description
+            inputs, outputs = (_names(described, c) for c in (Causality.INPUT, Causality.OUTPUT))
+            starts = [described.variable(name).start for name in inputs[1]]
+            slave.reset()
+            begin(slave, inputs[0], outputs[0], discrete=(inputs[1], outputs[1]))
+            seen.append([])
+
+            def step(time: float, value: float) -> None:
+                slave.set_inputs(np.full((1, len(inputs[0])), value))  # noqa: B023
+                slave.set_discrete_inputs(starts)  # noqa: B023
+                slave.do_step(time, 0.2, False)
+                seen[-1].append((slave.get_outputs(0).tobytes(), slave.get_discrete_outputs()))
+
+            step(0.0, 0.1)
+            state = slave.get_state()
+            step(0.2, 0.2)
+            step(0.4, 0.3)
+            slave.set_state(state)
+            step(0.2, 0.2)
+            step(0.4, 0.3)
+            slave.set_state_and_free(state)
+            seen[-1].append((slave.get_outputs(0).tobytes(), slave.get_discrete_outputs()))
+    assert seen[0] == seen[1]
+    first, second, third, again, and_again, back = seen[0]
+    assert (second, third, first) == (again, and_again, back)
+    assert len({*map(repr, (first, second, third))}) == 3
 
 
 def test_a_state_that_the_fmu_does_not_restore_is_restored_by_forking(capability_dir: Path) -> None:
