@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import emulated_inputs, in_process, memory, over_zenoh, tls
+from benchmarks import emulated_inputs, in_process, memory, over_zenoh, saved_states, tls
 
 TABLES = {
     "over_zenoh": (
@@ -24,6 +24,11 @@ TABLES = {
         "Inputs followed natively / emulated / held, quarter car",
         ("configuration", "accepted steps", "mean error", "slaves' time for a do_step"),
         emulated_inputs.run,
+    ),
+    "saved_states": (
+        "States saved by forking and natively",
+        ("what", "fork", "native", "ratio"),
+        saved_states.run,
     ),
     "memory": (
         "Resident memory over a million attempted double steps",

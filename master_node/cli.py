@@ -86,6 +86,10 @@ def run(  # noqa: PLR0917  options of the command line
     step_size: Annotated[
         float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
     ] = None,
+    state: Annotated[
+        str | None,
+        typer.Option(help="How all slaves save their states: native, fork, replay or none."),
+    ] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Run the slaves in this process, without a bus.")
     ] = False,
@@ -144,6 +148,7 @@ def run(  # noqa: PLR0917  options of the command line
                 initial_step_size=step_size,
                 examine=False if no_examine else None,
             )
+            .with_slaves(state=state)
             .with_bus(
                 connect=tuple(connect or ()),
                 listen=tuple(listen or ()),

@@ -311,6 +311,7 @@ class SlaveSettings(_Table):
             each, to follow polynomial inputs; 1: the inputs are constant in each step; 0: input
             derivatives where the model takes them, else as many substeps as the accuracy needs.
         largest_substep: its node splits steps so that no step of the model is longer [s].
+        state: how its state is saved; default: the best way that the model and its host allow.
     """
 
     model: StrictStr | None = None
@@ -325,6 +326,7 @@ class SlaveSettings(_Table):
     outputs_follow_inputs: StrictBool | None = None
     input_substeps: Annotated[StrictInt, Field(ge=0, le=10_000)] = 0
     largest_substep: Positive | None = None
+    state: Literal["native", "fork", "replay", "none"] | None = None
 
 
 class Connection(_Table):
@@ -574,6 +576,15 @@ class System(_Table):
         """The same system with other settings of one slave."""
         changed = self.slaves[name].model_dump(exclude_unset=True) | settings
         return self._with(slaves={**self.slaves, name: changed})
+
+    def with_slaves(self, **settings: Any) -> System:
+        """The same system with other settings of all slaves; None leaves one as it is."""
+        given = {name: value for name, value in settings.items() if value is not None}
+        slaves = {
+            name: slave.model_dump(exclude_unset=True) | given
+            for name, slave in self.slaves.items()
+        }
+        return self._with(slaves=slaves)
 
     def with_bus(self, **settings: Any) -> System:
         """The same system with other bus settings; None and empty ones leave one as it is."""

@@ -63,6 +63,7 @@ def configuration(slave: str, system: System, description: SlaveDescription) -> 
     settings = system.slaves[slave]
     largest = settings.largest_substep
     return Configure(
+        state_kind=settings.state or "",
         structural_parameters={
             name: value
             for name, value in settings.parameters.items()

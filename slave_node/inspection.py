@@ -9,6 +9,8 @@ from protocol.slave import SlaveDescription
 
 _STATE = {
     "native": "saved and restored by the model itself",
+    "fork": "saved by forking the process that holds the model",
+    "replay": "restored by doing everything again from the start time",
     "none": "cannot be saved: only a fixed communication step is possible (--estimator none)",
 }
 
@@ -32,7 +34,7 @@ def _model(description: SlaveDescription) -> Table:
         "generation tool": description.generation_tool,
         "guid": description.guid,
         "sha256": description.sha256,
-        "state": _STATE.get(description.state_kind, description.state_kind),
+        "state": _state(description),
         "state can be serialized": _yes(can.can_serialize_state),
         "interpolates inputs": _INPUTS[description.input_derivatives],
         "output derivatives up to order": str(can.max_output_derivative_order),
@@ -52,6 +54,11 @@ def _model(description: SlaveDescription) -> Table:
     for name, value in rows.items():
         table.add_row(name, value or "-")
     return table
+
+
+def _state(description: SlaveDescription) -> str:
+    reason = f" ({description.state_reason})" if description.state_reason else ""
+    return _STATE[description.state_kind] + reason
 
 
 def _variables(description: SlaveDescription) -> Table:
