@@ -202,7 +202,7 @@ def test_a_wish_that_cannot_be_met_names_the_slave(capability_dir: Path) -> None
         connections=DISPLACEMENT,
         base=capability_dir,
     )
-    with pytest.raises(ModelError, match=r"wheel: .*canGetAndSetFMUstate = false"):
+    with pytest.raises(ModelError, match=r"wheel: .*by native: .*does not declare"):
         simulate(system, in_process=True)
 
 
@@ -256,7 +256,7 @@ def test_inspect_says_how_and_why(capability_dir: Path) -> None:
         env={**os.environ, "COLUMNS": "300"},
     ).stdout
     assert "saved by forking the process that holds the model" in text
-    assert "canGetAndSetFMUstate = false" in text
+    assert "does not declare that it can save its state" in text
 
 
 # ---- No needless states -------------------------------------------------------------------------
