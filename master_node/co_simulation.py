@@ -55,6 +55,7 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
         )
     warnings = []
     for part in coupled.parts:
+        warnings += [f"{part.name}: {remark}" for remark in part.description.remarks]
         can = part.description.capabilities
         fixed = system.slaves[part.name].step_size or part.description.fixed_step_size
         if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:

@@ -128,6 +128,8 @@ def serve(  # noqa: PLR0917  options of the command line
         _end_with_parent(end)
     try:
         description = worker.start()
+        for remark in description.remarks:
+            log.warning("%s", remark)
         bus = ZenohBus(endpoints, stop=ending)
         node = SlaveNode(bus, worker, key, description)
         if not ending.is_set():
