@@ -234,6 +234,35 @@ def inspect(
         console.print(table)
 
 
+@app.command()
+def validate(
+    model: Model,
+    step_size: Annotated[
+        float | None, typer.Option(help="Of the trial steps [s] [default: the model's, or 0.01].")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Try what MODEL can do, and say what Doublestep does about the rest."""
+    from slave_node.validation import is_usable, unusable  # noqa: PLC0415
+    from slave_node.validation import validate as trials  # noqa: PLC0415
+
+    findings = []
+    if as_json:
+        findings = list(trials(model, Path.cwd(), step_size))
+        typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
+    else:
+        from rich.console import Console  # noqa: PLC0415
+
+        from slave_node.inspection import report_table  # noqa: PLC0415
+
+        console = Console()
+        with console.status("trying"):
+            findings = list(trials(model, Path.cwd(), step_size))
+        console.print(report_table(model, findings))
+    if not is_usable(findings):
+        raise unusable(model)
+
+
 def _where(endpoints: Endpoints) -> str:
     places = [f"at {e}" for e in endpoints.listen] + [f"to {e}" for e in endpoints.connect]
     return ", ".join(places)
