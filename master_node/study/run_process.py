@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,10 @@ from master_node.study.directory import put_in_place
 from master_node.study.records import CASE_FILE, LOG_FILE, RunRecord, write_record
 from protocol.errors import DeadlineError, ResultsError
 
-END_TIME = 0.6
-"""How long an interrupted run has to end by itself [s]."""
+END_TIME = 0.3
+"""How long an interrupted run has to end by itself [s]; nothing that it wrote is kept."""
 
+_LATE_TIME = 2.0
 _KILL_TIME = 5.0
 _PREFIX = "master-node: "
 _MESSAGE_LENGTH = 2000
@@ -65,6 +67,10 @@ class RunProcess:
         self._begin = monotonic()
         self._is_late = False
         try:
+            # What a run that is killed leaves behind goes with it.
+            self._scratch = tempfile.TemporaryDirectory(
+                prefix="doublestep-", ignore_cleanup_errors=True
+            )
             self._part.mkdir(parents=True)
             write_case(self._part / CASE_FILE, task.case)
             with (self._part / LOG_FILE).open("wb") as log:
@@ -74,7 +80,7 @@ class RunProcess:
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,  # Ctrl-C is for the sweep, which ends its runs
-                    env=_environment(),
+                    env=_environment(self._scratch.name),
                 )
         except OSError as error:
             raise ResultsError(f"cannot start run {task.number}: {error}") from error
@@ -97,10 +103,11 @@ class RunProcess:
             if not self._is_late and monotonic() - self._begin > self.task.timeout:
                 self._is_late = True
                 self.interrupt()
-                self.finish()
+                self.finish(monotonic() + _LATE_TIME)
             else:
                 return None
         record = self._record(self._process.returncode)
+        self._scratch.cleanup()
         try:
             write_record(self._part, record)
             put_in_place(self._part, self._directory)
@@ -128,6 +135,7 @@ class RunProcess:
 
     def remove(self) -> None:
         """Take away what an interrupted run has written."""
+        self._scratch.cleanup()
         shutil.rmtree(self._part, ignore_errors=True)
 
     def _record(self, exit_code: int) -> RunRecord:
@@ -152,6 +160,7 @@ class RunProcess:
         return ""
 
 
-def _environment() -> dict[str, str]:
+def _environment(scratch: str) -> dict[str, str]:
     """Runs beside each other are what uses the processors: no threads of NumPy within one."""
-    return {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg", **os.environ}
+    quiet = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    return {**quiet, **os.environ, "TMPDIR": scratch}
