@@ -21,6 +21,7 @@ check: $(STAMP) ## linter, formatter, type checker, import layers
 fmus: $(STAMP) ## compile the example FMUs
 	$(BIN)/python examples/quarter_car/build.py
 	$(BIN)/python examples/oscillators/build.py
+	$(BIN)/python examples/no_rollback/build.py
 
 benchmark: fmus ## the tables of docs/benchmarks.md
 	$(BIN)/python -m benchmarks

@@ -69,6 +69,16 @@ def run(  # noqa: PLR0917  options of the command line
     output_interval: Annotated[
         float | None, typer.Option(help="Write results at multiples of this [s].")
     ] = None,
+    output_variables: Annotated[
+        list[str] | None,
+        typer.Option(help="Pattern for slave.variable; !PATTERN leaves out; may be repeated."),
+    ] = None,
+    output_every: Annotated[
+        int | None, typer.Option(help="Keep each N-th result point, the first and the last.")
+    ] = None,
+    output_format: Annotated[
+        list[str] | None, typer.Option(help="csv, arrow, parquet or mat; may be repeated.")
+    ] = None,
     step_size: Annotated[
         float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
     ] = None,
@@ -100,7 +110,7 @@ def run(  # noqa: PLR0917  options of the command line
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
     stay_with_parent: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
-    """Run SYSTEM and write results.csv, steps.csv, summary.json and results.png."""
+    """Run SYSTEM and write results, by default results.csv, steps, summary and a picture."""
     with _interruptible(), ExitStack() as stack:
         if stay_with_parent:
             _end_with_parent()
@@ -135,6 +145,11 @@ def run(  # noqa: PLR0917  options of the command line
                 insecure=insecure,
                 discovery_timeout=timeout,
                 pin=pin,
+            )
+            .with_results(
+                variables=tuple(output_variables or ()),
+                every=output_every,
+                formats=tuple(output_format or ()),
             )
         )
         try:

@@ -1,11 +1,13 @@
 """One run of a coupled system: initialize, step to the stop time, terminate.
 
-Nothing here knows where a slave is. The steps themselves are in ``controlled_run.py`` and, without
-an estimator, in ``fixed_run.py``.
+Nothing here knows where a slave is. The steps themselves are in ``controlled_run.py``, with slaves
+of which some have no rollback in ``mixed_run.py``, of which none has in ``defect_run.py``, and,
+without an estimator, in ``fixed_run.py``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -13,36 +15,47 @@ import numpy as np
 
 from master_node.configuration import System
 from master_node.controlled_run import ControlledRun
-from master_node.coupling_scheme import CouplingScheme, outputs_follow_inputs
+from master_node.coupling_scheme import (
+    CouplingScheme,
+    output_control,
+    outputs_follow_inputs,
+    slaves_without_rollback,
+)
+from master_node.defect_run import DefectRun
 from master_node.fixed_run import FixedRun
 from master_node.initialization import initialize
+from master_node.mixed_run import MixedRun
 from master_node.numerics.error_estimators import ESTIMATORS
-from master_node.observers import Observer, Outcome, RunEnd, RunStart, Statistics
+from master_node.observers import DiscreteType, Observer, Outcome, RunEnd, RunStart, Statistics
+from master_node.outputs import Outputs
 from master_node.run_context import RunContext
 from master_node.slave_group import SlaveGroup
 from master_node.system import CoupledSystem
 from protocol.calls import Terminate
 from protocol.errors import ConfigurationError, InterruptedRunError
-from protocol.signals import FloatArray
+from protocol.slave import VariableType
 
 
 def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
     """What the slaves' capabilities mean for this run, as warnings for the user.
 
     Raises:
-        ConfigurationError: an estimator was asked for and a slave cannot save its state, or
-            cannot change its step size and has no ``step_size`` given.
+        ConfigurationError: an estimator was asked for and a slave cannot change its step size and
+            has no ``step_size`` given, or outputs are to be evaluated again where some slaves have
+            rollback and some have not.
     """
     settings = system.simulation
+    without = slaves_without_rollback(coupled)
+    is_mixed = settings.estimator != "none" and 0 < len(without) < len(coupled.parts)
+    if settings.evaluate_outputs and is_mixed:
+        raise ConfigurationError(
+            f"{coupled.parts[without[0]].name}: its state cannot be saved (canGetAndSetFMUstate), "
+            "so its outputs are not known when those of the others would be evaluated again",
+            remedy="leave out evaluate_outputs",
+        )
     warnings = []
     for part in coupled.parts:
         can = part.description.capabilities
-        if settings.estimator != "none" and not can.can_get_and_set_state:
-            raise ConfigurationError(
-                f"{part.name}: the model cannot save and restore its state "
-                "(canGetAndSetFMUstate), so steps cannot be controlled",
-                remedy="use --estimator none with a fixed --step-size",
-            )
         fixed = system.slaves[part.name].step_size
         if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:
             raise ConfigurationError(
@@ -92,6 +105,22 @@ def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:
     ]
 
 
+def _discrete_type(type_: VariableType) -> DiscreteType:
+    """What results hold for a variable of this type."""
+    if type_.is_real:
+        return "float"
+    if type_.integer_range is not None:
+        return "integer"
+    return _DISCRETE_TYPES[type_]
+
+
+_DISCRETE_TYPES: Mapping[VariableType, DiscreteType] = {
+    VariableType.BOOLEAN: "boolean",
+    VariableType.STRING: "string",
+    VariableType.BINARY: "binary",
+}
+
+
 @dataclass
 class CoSimulation:
     """One run of a coupled system, from instantiated slaves to terminated ones.
@@ -119,7 +148,7 @@ class CoSimulation:
         """
         settings = self.system.simulation
         scheme = CouplingScheme.of(self.coupled, self.system)
-        y = initialize(self.group, self.coupled, self.system, scheme.get_outputs).y
+        outputs = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
         self.group.restart_statistics()
         statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
         self.observer.started(
@@ -128,7 +157,13 @@ class CoSimulation:
                 self.coupled.output_units,
                 float(settings.start_time),
                 settings.end,
-                y[0],
+                outputs.y[0],
+                self.coupled.discrete.names,
+                tuple(map(_discrete_type, self.coupled.discrete.types)),
+                self.coupled.discrete.units,
+                outputs.d,
+                output_control(self.coupled, self.system),
+                {part.name: part.description.state_kind for part in self.coupled.parts},
             )
         )
         begin = perf_counter()
@@ -136,7 +171,7 @@ class CoSimulation:
         try:
             try:
                 with np.errstate(over="ignore", invalid="ignore"):  # the norm finds them
-                    note = self._steps(scheme, y, statistics)
+                    note = self._steps(scheme, outputs, statistics)
             finally:
                 statistics.wall_time = perf_counter() - begin
                 statistics.round_trips = self.group.round_trips
@@ -154,15 +189,19 @@ class CoSimulation:
             self.observer.ended(RunEnd(outcome, statistics, message))
         return statistics
 
-    def _steps(self, scheme: CouplingScheme, y: FloatArray, statistics: Statistics) -> str:
+    def _steps(self, scheme: CouplingScheme, outputs: Outputs, statistics: Statistics) -> str:
         """Step to the end; a slave's wish to end earlier is returned in words."""
         context = RunContext(
             self.group, self.coupled, scheme, self.system, self.observer, statistics
         )
         estimator = ESTIMATORS.get(self.system.simulation.estimator)
         if estimator is None:
-            return FixedRun(context).run(y)
-        return ControlledRun(context, estimator).run(y)
+            return FixedRun(context).run(outputs)
+        if len(slaves_without_rollback(self.coupled)) == len(self.coupled.parts):
+            return DefectRun(context).run(outputs)
+        if scheme.late_slaves:
+            return MixedRun(context, estimator).run(outputs)
+        return ControlledRun(context, estimator).run(outputs)
 
     def _terminate(self, time: float) -> None:
         self.group.execute_all([(Terminate(),)] * len(self.group), time)

@@ -5,12 +5,15 @@ point, the second is interpolated there by ``scipy.interpolate.PchipInterpolator
 cubic that does not overshoot at jumps. (A spline through all points would ring there, and a
 straight line would be farther off than most tolerances.) The interpolation has an error of its
 own: let b be the one with more points.
+
+Discrete variables keep their value up to the next point, and must be equal unless they are floats.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +33,12 @@ class VariableComparison:
     Attributes:
         name: ``slave.variable``.
         unit: "" where none is known; both, when the results differ in it.
-        largest_difference: max |a - b| [unit]; inf where a value on one side only is finite.
+        largest_difference: max |a - b| [unit]; inf where a value on one side only is finite; 1
+            where texts or binary values differ.
         time: where that is [s].
         rms: root of the mean of (a - b)**2 [unit].
-        within_tolerance: |a - b| <= atol + rtol * |b| at every point.
+        within_tolerance: |a - b| <= atol + rtol * |b| at every point, or a = b where they are not
+            of type float.
     """
 
     name: str
@@ -120,14 +125,14 @@ class Comparison:
 
 
 def compare(a: Path, b: Path, rtol: float, atol: float) -> Comparison:
-    """Compare two results directories, or CSV files with ``time`` first; b is the reference.
+    """Compare two results directories, or files with ``time`` first; b is the reference.
 
     Raises:
         ResultsError: one of them cannot be read, they share no variable or no point of time, or
             the time of one goes back.
     """
     first, second = Result.load(a), Result.load(b)
-    names = [name for name in first.names if name in second]
+    names = [name for name in first if name in second]
     if not names:
         raise ResultsError(f"{a} and {b} have no variable in common")
     start, stop = _common_range(a, first.time, b, second.time)
@@ -136,32 +141,35 @@ def compare(a: Path, b: Path, rtol: float, atol: float) -> Comparison:
     if not len(time):
         raise ResultsError(f"{a} has no point from {start:g} to {stop:g} s, where {b} has some")
     onto = _Onto(time, second.time)
+    discrete = {*first.discrete, *second.discrete}
     return Comparison(
         a=a,
         b=b,
         rtol=rtol,
         atol=atol,
         variables=tuple(
-            _compare_variable(
+            (_compare_discrete if name in discrete else _compare_variable)(
                 name,
                 " / ".join(dict.fromkeys(filter(None, (first.units[name], second.units[name])))),
                 time,
                 a=first[name][inside],
-                b=onto(second[name]),
+                b=onto.held(second[name]) if name in discrete else onto(second[name]),
                 rtol=rtol,
                 atol=atol,
             )
             for name in names
         ),
-        only_in_a=tuple(name for name in first.names if name not in second),
-        only_in_b=tuple(name for name in second.names if name not in first),
+        only_in_a=tuple(name for name in first if name not in second),
+        only_in_b=tuple(name for name in second if name not in first),
         start_time=start,
         stop_time=stop,
         points=len(time),
         interpolated_points=int(np.count_nonzero(~onto.shared)),
         equal_bits=first.names == second.names
         and _bits(first.time) == _bits(second.time)
-        and _bits(first.outputs) == _bits(second.outputs),
+        and _bits(first.outputs) == _bits(second.outputs)
+        and list(first.discrete) == list(second.discrete)
+        and all(_same(first[name], second[name]) for name in first.discrete),
     )
 
 
@@ -194,6 +202,11 @@ class _Onto:
             )
         return result
 
+    def held(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Those of the last node at or before each point."""
+        kept: NDArray[Any] = values[self._kept]
+        return kept[np.where(self.shared, self._index, self._index - 1)]
+
 
 def _compare_variable(
     name: str,
@@ -224,6 +237,27 @@ def _compare_variable(
     )
 
 
+def _compare_discrete(
+    name: str,
+    unit: str,
+    time: FloatArray,
+    *,
+    a: NDArray[Any],
+    b: NDArray[Any],
+    rtol: float,
+    atol: float,
+) -> VariableComparison:
+    if a.dtype.kind == b.dtype.kind == "f":
+        return _compare_variable(name, unit, time, a=a, b=b, rtol=rtol, atol=atol)
+    equal = np.asarray(a == b, np.bool_)
+    if "O" in (a.dtype.kind, b.dtype.kind):
+        a, b = ~equal, np.zeros(len(equal))
+    compared = _compare_variable(
+        name, unit, time, a=a.astype(np.float64), b=b.astype(np.float64), rtol=0.0, atol=0.0
+    )
+    return replace(compared, within_tolerance=bool(equal.all()))
+
+
 def _common_range(a: Path, time_a: FloatArray, b: Path, time_b: FloatArray) -> tuple[float, float]:
     for path, time in ((a, time_a), (b, time_b)):
         if not len(time):
@@ -240,5 +274,11 @@ def _common_range(a: Path, time_a: FloatArray, b: Path, time_b: FloatArray) -> t
     return start, stop
 
 
-def _bits(values: FloatArray) -> bytes:
+def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    if a.dtype.kind == "O":
+        return bool(a.tolist() == b.tolist())
+    return a.dtype == b.dtype and _bits(a) == _bits(b)
+
+
+def _bits(values: NDArray[Any]) -> bytes:
     return np.asarray(values.shape).tobytes() + values.tobytes()

@@ -52,10 +52,24 @@ def _reference(value: str) -> str:
     return value
 
 
+def _pattern(value: str) -> str:
+    if not value.removeprefix("!"):
+        raise ValueError("write a pattern for slave.variable")
+    return value
+
+
+def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not value:
+        raise ValueError("must not be empty")
+    return value
+
+
 Number = Annotated[StrictFloat, AfterValidator(_finite)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Reference = Annotated[StrictStr, AfterValidator(_reference)]
+Pattern = Annotated[StrictStr, AfterValidator(_pattern)]
+Format = Literal["csv", "arrow", "parquet", "mat"]
 Scalar = StrictBool | StrictInt | StrictFloat | StrictStr
 Value = Scalar | tuple[Scalar, ...] | tuple[tuple[Scalar, ...], ...]
 """A value, or those of an array with one or two dimensions."""
@@ -462,6 +476,20 @@ class BusSettings(_Table):
     pin: StrictBool = False
 
 
+class ResultsSettings(_Table):
+    """The ``[results]`` table.
+
+    Attributes:
+        variables: patterns for ``slave.variable``; those that begin with ``!`` leave out.
+        every: of the points after the first each ``every``-th is a result, and the last.
+        formats: of the result files.
+    """
+
+    variables: Annotated[tuple[Pattern, ...], AfterValidator(_not_empty)] = ("*",)
+    every: Annotated[StrictInt, Field(ge=1)] = 1
+    formats: Annotated[tuple[Format, ...], AfterValidator(_not_empty)] = ("csv",)
+
+
 class System(_Table):
     """A whole system: what a system file holds.
 
@@ -476,6 +504,7 @@ class System(_Table):
     slaves: Mapping[str, SlaveSettings]
     connections: tuple[Connection, ...] = ()
     inputs: Mapping[Reference, InputValue] = Field(default_factory=dict)
+    results: ResultsSettings = ResultsSettings()
     bus: BusSettings = BusSettings()
     base: Path = Field(default_factory=Path.cwd, exclude=True)
     source: str = Field(default="the system", exclude=True)
@@ -548,8 +577,13 @@ class System(_Table):
         given = {name: value for name, value in settings.items() if value not in (None, (), False)}
         return self._with(bus=self.bus.model_dump(exclude_unset=True) | given)
 
+    def with_results(self, **settings: Any) -> System:
+        """The same system with other results settings; None and empty ones leave one as it is."""
+        given = {name: value for name, value in settings.items() if value not in (None, ())}
+        return self._with(results=self.results.model_dump(exclude_unset=True) | given)
+
     def _with(self, **tables: Any) -> System:
-        kept = {"simulation", "slaves", "connections", "inputs", "bus"} - tables.keys()
+        kept = {"simulation", "slaves", "connections", "inputs", "results", "bus"} - tables.keys()
         return System(
             **{name: getattr(self, name) for name in kept},
             **tables,
@@ -646,6 +680,8 @@ def _known_keys(place: list[str]) -> list[str]:
     match place:
         case ["simulation"]:
             model = SimulationSettings
+        case ["results"]:
+            model = ResultsSettings
         case ["bus"]:
             model = BusSettings
         case ["slaves", _]:

@@ -1,6 +1,6 @@
 """A run with error-controlled step sizes: attempt -> judge -> accept or go back.
 
-What is tried next is a value (`_Position`), so a rejected step is one that is not put in its place.
+What is tried next is a value (`Position`), so a rejected step is one that is not put in its place.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from master_node.numerics.step_size_controller import (
 )
 from master_node.observers import Attempt, Points
 from master_node.order_selection import OrderSelection
-from master_node.result_points import Reached, ResultPoints, count_accepted
+from master_node.outputs import Outputs
+from master_node.result_points import Reached, ReachedPoint, ResultPoints, count_accepted
 from master_node.run_context import RunContext
 from master_node.step_requests import FailedStep
 from master_node.step_size_rules import crossings, step_size_limits
-from protocol.errors import DoublestepError, StepSizeError
-from protocol.signals import FloatArray
+from protocol.errors import DoublestepError, SlaveError, StepSizeError
 from protocol.slave import StepStatus
 
 _INF = float("inf")
@@ -46,31 +46,34 @@ _TRIALS = 5
 
 
 @dataclass(frozen=True, slots=True)
-class _Position:
+class Position:
     """Where a run stands and what it will try next.
 
     Attributes:
         history: inputs up to T_n.
-        y: outputs at T_n, shape (rows, m).
+        outputs: at T_n, those of continuous variables of shape (rows, m).
         step_size: H that is wanted [s].
         controller: the step size controller's memory.
         order: the order control's memory; holds the input polynomial.
         bracket: of a jump that is being looked for.
         smooth: step size and largest defect of the last accepted step.
         errors_in_a_row: attempts that a slave ended with an error.
+        event: where a slave has returned early, and a double step must end [s]; None: nowhere.
     """
 
     history: CouplingHistory
-    y: FloatArray
+    outputs: Outputs
     step_size: float
     order: OrderMemory
     controller: ControllerMemory = NOTHING
     bracket: Bracket = NO_JUMP
     smooth: tuple[float, float] | None = None
     errors_in_a_row: int = 0
+    event: float | None = None
 
     @property
     def time(self) -> float:
+        """T_n [s]."""
         return self.history.times[0]
 
 
@@ -100,8 +103,8 @@ class ControlledRun:
         # Where H is a multiple of something a double step cannot end wherever a kink is.
         kinks = external.kinks if self._limits.quantum is None else ()
         self._landing_points = LandingPoints(kinks, self._limits.smallest)
-        self._stepper = DoubleStepper(context.group, coupled, scheme, estimator)
-        self._control = ErrorControl(coupled, scheme, estimator, settings.constants)
+        self._stepper = self._make_stepper(context, estimator)
+        self._control = self._make_control(context, estimator)
         self._defects = InputDefects(coupled, scheme, self._control)
         present, past = EXPONENTS[settings.controller]
         self._controller = StepSizeController(
@@ -116,17 +119,28 @@ class ControlledRun:
         )
         self._orders = None
         if settings.order == "auto":
-            self._orders = OrderSelection(
-                coupled,
-                scheme,
-                control=self._control,
-                estimator=estimator,
-                largest=settings.polynomial,
-                alpha=settings.alpha,
-            )
+            self._orders = self._make_orders(context, estimator)
 
-    def run(self, y: FloatArray) -> str:
-        """Step from outputs ``y`` at T_0, shape (rows, m), to the stop time.
+    def _make_stepper(self, context: RunContext, estimator: ErrorEstimator) -> DoubleStepper:
+        return DoubleStepper(context.group, context.coupled, context.scheme, estimator)
+
+    def _make_control(self, context: RunContext, estimator: ErrorEstimator) -> ErrorControl:
+        constants = context.system.simulation.constants
+        return ErrorControl(context.coupled, context.scheme, estimator, constants)
+
+    def _make_orders(self, context: RunContext, estimator: ErrorEstimator) -> OrderSelection:
+        settings = context.system.simulation
+        return OrderSelection(
+            context.coupled,
+            context.scheme,
+            control=self._control,
+            estimator=estimator,
+            largest=settings.polynomial,
+            alpha=settings.alpha,
+        )
+
+    def run(self, outputs: Outputs) -> str:
+        """Step from outputs at T_0, those of continuous variables (rows, m), to the stop time.
 
         Returns:
             A slave's wish to end earlier in words, or "".
@@ -135,9 +149,9 @@ class ControlledRun:
             DoublestepError: a slave was lost or failed, or H would have to be too small.
         """
         self._results = ResultPoints(
-            self._settings.output_grid, self._scheme.has_derivative, self._start, y
+            self._settings.output_grid, self._scheme.has_derivative, self._start, outputs
         )
-        position = self._first_position(y)
+        position = self._first_position(outputs)
         for target, crossing in self._targets():
             while position.time < target:
                 following = self._advance(position, target)
@@ -159,13 +173,11 @@ class ControlledRun:
 
     # --- beginnings -----------------------------------------------------------------------------
 
-    def _first_position(self, y: FloatArray) -> _Position:
-        settings, u = self._settings, self._coupled.inputs_of(y)
-        points = settings.polynomial.order + 1  # an input without a derivative needs them all
-        depth = self._estimator.points(points) + self._scheme.known_ahead
-        depth = max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
+    def _first_position(self, outputs: Outputs) -> Position:
+        settings, u = self._settings, self._coupled.inputs_of(outputs.y)
+        depth = self._depth(settings.polynomial.order + 1)  # inputs without derivatives need all
         history = CouplingHistory.start(self._start, u, depth)
-        position = _Position(history, y, settings.step_size, self._restarted_order())
+        position = Position(history, outputs, settings.step_size, self._restarted_order())
         if settings.initial_step_size is None:
             position = self._with_initial_step_size(position, self._limits.largest)
         step_size = self._controller.bounded(position.step_size)
@@ -173,14 +185,19 @@ class ControlledRun:
             history = CouplingHistory.at_rest(self._start, u, depth, step_size)
         return replace(position, history=history, step_size=step_size)
 
+    def _depth(self, points: int) -> int:
+        """How many communication points are kept for polynomials through ``points`` points."""
+        depth = self._estimator.points(points) + self._scheme.known_ahead
+        return max(depth + 1, DEPTH if self._orders else 0)  # and one that a step pushes out
+
     def _restarted_order(self) -> OrderMemory:
         if self._orders is None:
             return OrderMemory(self._settings.polynomial)
         return self._orders.restart()
 
-    def _with_initial_step_size(self, position: _Position, largest: float) -> _Position:
+    def _with_initial_step_size(self, position: Position, largest: float) -> Position:
         """The position with H from the behaviour of the slaves there, ``largest`` at most [s]."""
-        y, stop = position.y, self._settings.end
+        y, stop = position.outputs.y, self._settings.end
         scale = 1.0 / self._control.weights(y[0])
         slope = y[1] if len(y) > 1 else None
         trial = trial_step_size(y[0], slope, scale, stop - self._start)
@@ -190,7 +207,7 @@ class ControlledRun:
                 self._start, position.time, max(trial, self._limits.smallest), stop
             )
             polynomials = self._polynomials(position)
-            step = self._stepper.attempt(position.history, times, polynomials)
+            step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
             if isinstance(step, DoubleStep):
                 error = self._control.judge(step)
                 if error.norm < _INF:
@@ -208,52 +225,58 @@ class ControlledRun:
             trial = 0.1 * times.first
         return replace(position, step_size=self._controller.bounded(trial))
 
-    def _polynomials(self, position: _Position) -> Polynomials:
+    def _polynomials(self, position: Position) -> Polynomials:
         points = self._estimator.available(len(position.history.times))
         return self._scheme.extrapolation.polynomials(position.order.polynomial, points)
 
     # --- one attempt ----------------------------------------------------------------------------
 
-    def _advance(self, position: _Position, target: float) -> _Position | str:
+    def _advance(self, position: Position, target: float) -> Position | str:
         """One double step, or the attempt of one, towards ``target`` [s]."""
         wanted = step_within(
             position.bracket, position.time, position.step_size, self._limits.smallest
         )
+        if position.event is not None:
+            target = min(target, position.event)
         target = self._landing_points.target(
             position.time, wanted, target, first=position.controller.rejected
         )
         times = self._limits.times(self._start, position.time, wanted, target)
         polynomials = self._polynomials(position)
-        step = self._stepper.attempt(position.history, times, polynomials)
+        step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
         if isinstance(step, FailedStep):
             return self._after_failure(position, step, times, polynomials)
         error = self._control.judge(step)
-        if not self._settings.discontinuities:
-            if error.norm <= 1.0:
-                return self._accept(position, step, error, None)
-            return self._reject(position, step, error, None)
-        defects = self._defects.of(step, position.history, position.y, position.smooth)
-        jumps = (
-            position.bracket.shows_jump(defects)
-            or has_jumped_unnoticed(defects)
-            or does_not_shrink(position.bracket, times.first, defects)
-        )
-        if jumps and self._is_smallest(times):
-            name = f"{self._defects.name(defects)} jumps"
-            return self._accept_jump(position, step, error, name)
+        event = self._event(position, step)
+        defects, jumps = None, False
+        if self._settings.discontinuities:
+            defects = self._defects.of(step, position.history, position.outputs.y, position.smooth)
+            jumps = (
+                position.bracket.shows_jump(defects)
+                or has_jumped_unnoticed(defects)
+                or does_not_shrink(position.bracket, times.first, defects)
+            )
+            if jumps:
+                event = event or f"{self._defects.name(defects)} jumps"
+        if event and self._is_smallest(times):
+            return self._accept_jump(position, step, error, event)
         if error.norm <= 1.0 and not jumps:
             return self._accept(position, step, error, defects)
         return self._reject(position, step, error, defects)
 
     def _accept(
-        self, position: _Position, step: DoubleStep, error: StepError, defects: Defects | None
-    ) -> _Position:
+        self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
+    ) -> Position:
         self._stepper.accepted()
         times, polynomials = step.times, step.polynomials
         history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
-        reached: Reached = ((times.middle, step.middle), (times.end, step.end))
+        reached = _reached(step)
         order = max(polynomial.order for polynomial in polynomials)
         self._tell_accepted(step, error, reached, self._results.reached(reached, order))
+        if self._event(position, step):
+            self._statistics.discontinuities += 1
+            self._results.cut(reached[-1])
+            return self._behind_event(position, step, history)
         _, following, controller = self._controller.decide(
             times.first, error.norm, self._control.exponent(polynomials), position.controller
         )
@@ -272,13 +295,13 @@ class ControlledRun:
         if bracket.end is not None:
             self._statistics.double_steps_at_discontinuities += 1
             if times.end >= bracket.end:  # a false alarm; points so near say nothing of larger H
-                return _Position(
-                    history.cut(), step.end, position.step_size, self._restarted_order()
+                return Position(
+                    history.cut(), _end(step), position.step_size, self._restarted_order()
                 )
         smooth = None if defects is None else (times.first, defects.largest)
-        return _Position(
+        return Position(
             history,
-            step.end,
+            _end(step),
             following,
             memory,
             controller,
@@ -287,8 +310,8 @@ class ControlledRun:
         )
 
     def _reject(
-        self, position: _Position, step: DoubleStep, error: StepError, defects: Defects | None
-    ) -> _Position:
+        self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
+    ) -> Position:
         times, bracket = step.times, position.bracket
         is_noticed = error.norm > 1.0 or not error.norm < _INF
         if self._is_smallest(times) and is_noticed:
@@ -315,13 +338,15 @@ class ControlledRun:
 
     def _after_failure(
         self,
-        position: _Position,
+        position: Position,
         failed: FailedStep,
         times: DoubleStepTimes,
         polynomials: Polynomials,
-    ) -> _Position | str:
+    ) -> Position | str:
         if failed.status is StepStatus.TERMINATED:
             return f"{failed.slave} ended the simulation after t={times.begin!r} s"
+        if failed.status is StepStatus.EARLY_RETURN:
+            return self._before_event(position, failed, times, polynomials)
         errors_in_a_row = position.errors_in_a_row + (failed.error is not None)
         if failed.error is not None and errors_in_a_row > 1:
             raise failed.error
@@ -334,6 +359,26 @@ class ControlledRun:
             controller=position.controller._replace(rejected=True),
             errors_in_a_row=errors_in_a_row,
         )
+
+    def _before_event(
+        self,
+        position: Position,
+        failed: FailedStep,
+        times: DoubleStepTimes,
+        polynomials: Polynomials,
+    ) -> Position:
+        """Go back, to end the next double step where a slave has found an event."""
+        self._tell_rejected(times, polynomials, _INF, failed.reason)
+        if not failed.time > times.begin:
+            raise SlaveError(
+                "do_step returned early without getting anywhere",
+                slave=failed.slave,
+                phase="do_step",
+                time=times.begin,
+                step_size=times.first,
+                remedy="the model may have an error in its event handling",
+            )
+        return replace(position, event=failed.time)
 
     def _is_smallest(self, times: DoubleStepTimes) -> bool:
         return times.first <= self._limits.smallest
@@ -358,10 +403,10 @@ class ControlledRun:
 
     # --- discontinuities ------------------------------------------------------------------------
 
-    def _cross(self, position: _Position, times: DoubleStepTimes, name: str) -> _Position | str:
+    def _cross(self, position: Position, times: DoubleStepTimes, name: str) -> Position | str:
         """The double step over a known event, whatever its error is."""
         polynomials = self._polynomials(position)
-        step = self._stepper.attempt(position.history, times, polynomials)
+        step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
         if isinstance(step, FailedStep):
             following = self._after_failure(position, step, times, polynomials)
             assert isinstance(following, str)  # such a small step is not made smaller
@@ -372,8 +417,8 @@ class ControlledRun:
         return self._accept_jump(position, step, error, name)
 
     def _accept_jump(
-        self, position: _Position, step: DoubleStep, error: StepError, name: str
-    ) -> _Position:
+        self, position: Position, step: DoubleStep, error: StepError, name: str
+    ) -> Position:
         """Go on behind a discontinuity: history cut, order and step size as at the start."""
         if not error.norm < _INF:
             raise self._stuck(error, step.times)
@@ -381,14 +426,29 @@ class ControlledRun:
         self._statistics.discontinuities += 1
         self._statistics.double_steps_at_discontinuities += 1
         times = step.times
-        reached: Reached = ((times.middle, step.middle), (times.end, step.end))
+        reached = _reached(step)
         error = error._replace(limiting_variable=name)
         self._tell_accepted(step, error, reached, self._results.jumped(reached))
-        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end)).cut()
-        behind = _Position(history, step.end, position.step_size, self._restarted_order())
-        if times.end >= self._settings.end:
+        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
+        return self._behind_event(position, step, history)
+
+    def _behind_event(
+        self, position: Position, step: DoubleStep, history: CouplingHistory
+    ) -> Position:
+        """Where to go on: the past says nothing any more."""
+        behind = Position(history.cut(), _end(step), position.step_size, self._restarted_order())
+        if step.times.end >= self._settings.end:
             return behind
         return self._with_initial_step_size(behind, position.step_size)
+
+    def _event(self, position: Position, step: DoubleStep) -> str:
+        """What changed at once in a double step, in words; "" if nothing did."""
+        if position.event is not None and step.times.end >= position.event:
+            return "event"
+        d_middle, d_end = step.discrete
+        changed = self._coupled.discrete.changed
+        name = changed(position.outputs.d, d_middle) or changed(d_middle, d_end)
+        return f"{name} changes" if name else ""
 
     # --- what observers and counters are told ---------------------------------------------------
 
@@ -404,6 +464,18 @@ class ControlledRun:
     ) -> None:
         self._statistics.rejected_double_steps += 1
         self._observer.attempted(_attempt(times, polynomials, norm, reason))
+
+
+def _reached(step: DoubleStep) -> Reached:
+    d_middle, d_end = step.discrete
+    return (
+        ReachedPoint(step.times.middle, step.middle, d_middle),
+        ReachedPoint(step.times.end, step.end, d_end),
+    )
+
+
+def _end(step: DoubleStep) -> Outputs:
+    return Outputs(step.end, step.discrete[1])
 
 
 def _attempt(

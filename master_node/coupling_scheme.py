@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from master_node.configuration import System
 from master_node.numerics.extrapolation import Extrapolation, InputKind
+from master_node.observers import NOT_CONTROLLED, OutputControl
 from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import GetOutputs
 
@@ -25,6 +26,8 @@ class CouplingScheme:
     Attributes:
         groups: indices of the slaves that take a step at the same time, group after group: one
             group of all (Jacobi), or one slave in each (Gauss-Seidel).
+        late_slaves: indices of the slaves that are in no group: they have no rollback, and take
+            their steps when the double step of all others is accepted.
         extrapolation: the inputs' polynomials.
         input_rows: for each slave how many rows of input derivatives it takes at most.
         get_outputs: for each slave the call that reads its outputs, with the derivatives where
@@ -35,10 +38,12 @@ class CouplingScheme:
         feed_through: for each output whether it depends directly on extrapolated inputs, shape
             (m,).
         evaluated: indices of the slaves whose outputs are evaluated again at communication points.
-        output_kinds: for each output the kinds of its slave's inputs; empty without inputs.
+        output_kinds: for each output the kinds of its slave's inputs of which a comparison
+            solution can tell the error; empty without such inputs.
     """
 
     groups: tuple[tuple[int, ...], ...]
+    late_slaves: tuple[int, ...]
     extrapolation: Extrapolation
     input_rows: tuple[int, ...]
     get_outputs: tuple[GetOutputs, ...]
@@ -59,12 +64,15 @@ class CouplingScheme:
         """The scheme that ``system`` asks for, as far as the slaves can follow."""
         settings = system.simulation
         wanted = settings.polynomial
-        indices = range(len(coupled.parts))
+        late_slaves = _late_slaves(coupled, system)
+        indices = [i for i in range(len(coupled.parts)) if i not in late_slaves]
         groups: tuple[tuple[int, ...], ...] = (tuple(indices),)
         if settings.sequence == "gauss-seidel":
             groups = tuple((i,) for i in indices)
         evaluated = _evaluated(coupled, system) if settings.evaluate_outputs else ()
-        feed_through = coupled.feed_through & ~np.isin(coupled.output_slave, evaluated)
+        feed_through = coupled.feed_through & ~np.isin(
+            coupled.output_slave, (*evaluated, *late_slaves)
+        )
         derivative_orders = [
             min(1, part.description.capabilities.max_output_derivative_order)
             if wanted.derivative_points
@@ -73,7 +81,8 @@ class CouplingScheme:
         ]
         reads_derivative = np.array(derivative_orders, dtype=bool)[coupled.output_slave]
         has_derivative = reads_derivative & ~coupled.feed_through & ~coupled.held_feed_through
-        group_of_slave = {slave: i for i, group in enumerate(groups) for slave in group}
+        sequence = (*groups, late_slaves)
+        group_of_slave = {slave: i for i, group in enumerate(sequence) for slave in group}
         kinds: list[InputKind] = []
         kind_of_input = []
         for target, part in enumerate(coupled.parts):
@@ -86,14 +95,21 @@ class CouplingScheme:
                     max_order=min(part.max_order, wanted.order),
                     has_derivative=bool(has_derivative[source]) and not ahead,
                     ahead=ahead,
+                    late=feeding in late_slaves and target not in late_slaves,
                 )
                 if kind not in kinds:
                     kinds.append(kind)
                 kind_of_input.append(kinds.index(kind))
         kind_array = np.array(kind_of_input, dtype=np.intp)
-        slave_kinds = [frozenset(kind_array[part.input_slice].tolist()) for part in coupled.parts]
+        slave_kinds = [
+            frozenset(i for i in kind_array[part.input_slice].tolist() if not kinds[i].late)
+            if slave not in late_slaves
+            else frozenset[int]()
+            for slave, part in enumerate(coupled.parts)
+        ]
         return CouplingScheme(
             groups=groups,
+            late_slaves=late_slaves,
             extrapolation=Extrapolation(kinds or [InputKind(0)], kind_array),
             input_rows=tuple(part.max_order + 1 for part in coupled.parts),
             get_outputs=tuple(GetOutputs(order) for order in derivative_orders),
@@ -106,6 +122,36 @@ class CouplingScheme:
             evaluated=evaluated,
             output_kinds=tuple(slave_kinds[slave] for slave in coupled.output_slave),
         )
+
+
+def slaves_without_rollback(coupled: CoupledSystem) -> tuple[int, ...]:
+    """Indices of the slaves whose state cannot be saved in any way."""
+    return tuple(i for i, part in enumerate(coupled.parts) if part.description.state_kind == "none")
+
+
+def output_control(coupled: CoupledSystem, system: System) -> OutputControl:
+    """Which outputs are controlled how; none without an estimator."""
+    if system.simulation.estimator == "none":
+        return NOT_CONTROLLED
+    without = slaves_without_rollback(coupled)
+    with_defects = {
+        slave
+        for slave, part in enumerate(coupled.parts)
+        if slave in without
+        or np.isin(coupled.output_slave[coupled.source[part.input_slice]], without).any()
+    }
+    owners = list(zip(coupled.output_names, coupled.output_slave.tolist(), strict=True))
+    return OutputControl(
+        double_step=tuple(name for name, slave in owners if slave not in without),
+        input_defects=tuple(name for name, slave in owners if slave in with_defects),
+    )
+
+
+def _late_slaves(coupled: CoupledSystem, system: System) -> tuple[int, ...]:
+    """Those that others take double steps before; none where nobody takes any."""
+    slaves = slaves_without_rollback(coupled)
+    is_mixed = system.simulation.estimator != "none" and len(slaves) < len(coupled.parts)
+    return slaves if is_mixed else ()
 
 
 def _evaluated(coupled: CoupledSystem, system: System) -> tuple[int, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from master_node.connections import ScalarConnection
 from master_node.type_casts import Cast
@@ -16,6 +17,10 @@ from protocol.signals import FloatArray
 from protocol.slave import Causality, SlaveDescription, StartValue, VariableType
 
 DiscreteValues = tuple[StartValue, ...]
+"""Values of the discrete outputs; None stands for one that was not read."""
+
+Held = tuple[DiscreteValues, ...]
+"""For each slave the values of its discrete inputs; empty where no slave has any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,35 +57,61 @@ class DiscreteCoupling:
 
     Attributes:
         keys: slave and variable of each discrete output.
-        types: of the discrete outputs.
+        types, units: of the discrete outputs.
         output_slices: for each slave where its discrete outputs are among all of them.
         inputs: for each slave its discrete inputs, in order.
     """
 
     keys: tuple[tuple[str, str], ...]
     types: tuple[VariableType, ...]
+    units: tuple[str, ...]
     output_slices: tuple[slice, ...]
     inputs: tuple[tuple[HeldInput, ...], ...]
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """``slave.variable`` of each discrete output."""
         return tuple(f"{slave}.{variable}" for slave, variable in self.keys)
 
-    @property
+    @cached_property
     def is_empty(self) -> bool:
         """Whether all of the system is continuous."""
-        return not self.keys and not any(self.inputs)
+        return not self.keys and not self.holds_inputs
 
-    def inputs_of(self, slave: int, y: FloatArray, d: DiscreteValues) -> DiscreteValues:
-        """The discrete inputs of a slave that belong to outputs.
+    @cached_property
+    def holds_inputs(self) -> bool:
+        """Whether any slave has discrete inputs that are connected."""
+        return any(self.inputs)
+
+    @cached_property
+    def _connected(self) -> tuple[int, ...]:
+        """Indices of the discrete outputs that feed an input."""
+        feeding = {held.output for inputs in self.inputs for held in inputs}
+        return tuple(sorted(index for index in feeding if index is not None))
+
+    def held(self, y: FloatArray, d: DiscreteValues) -> Held:
+        """The discrete inputs that belong to outputs.
 
         Args:
-            slave: its index.
             y: continuous outputs, shape (m,).
             d: discrete outputs.
         """
-        return tuple(held.value(y, d) for held in self.inputs[slave])
+        if not self.holds_inputs:
+            return ()
+        return tuple(tuple(held.value(y, d) for held in inputs) for inputs in self.inputs)
+
+    def filled(self, known: DiscreteValues, before: DiscreteValues) -> DiscreteValues:
+        """Discrete outputs with those of ``before`` where nobody was asked."""
+        if not self.keys:
+            return ()
+        return tuple(b if k is None else k for k, b in zip(known, before, strict=True))
+
+    def changed(self, before: DiscreteValues, after: DiscreteValues) -> str:
+        """``slave.variable`` of a discrete output that has changed and feeds an input, or ""."""
+        for index in self._connected:
+            if before[index] != after[index]:
+                return self.names[index]
+        return ""
 
 
 def couple_discrete(
@@ -96,17 +127,20 @@ def couple_discrete(
         continuous_outputs: indices of the continuous outputs by slave and variable.
     """
     keys: list[tuple[str, str]] = []
-    types = []
+    types: list[VariableType] = []
+    units: list[str] = []
     slices = []
     for slave, description in descriptions.items():
         outputs = [v for v in description.of(Causality.OUTPUT) if not v.is_continuous_real]
         slices.append(slice(len(keys), len(keys) + len(outputs)))
         keys += [(slave, variable.name) for variable in outputs]
         types += [variable.type for variable in outputs]
+        units += [variable.unit for variable in outputs]
     index = {key: i for i, key in enumerate(keys)}
     return DiscreteCoupling(
         tuple(keys),
         tuple(types),
+        tuple(units),
         tuple(slices),
         tuple(
             tuple(

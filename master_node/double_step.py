@@ -21,10 +21,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from master_node.coupling_scheme import CouplingScheme
+from master_node.discrete_coupling import DiscreteValues
+from master_node.discrete_step_requests import step_requests
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import Comparison, ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials
+from master_node.outputs import NO_OUTPUTS, Outputs
 from master_node.slave_group import SlaveGroup
 from master_node.step_requests import (
     RESTORE_HALFWAY,
@@ -34,7 +39,6 @@ from master_node.step_requests import (
     FailedStep,
     Inputs,
     Piece,
-    StepRequests,
 )
 from master_node.system import CoupledSystem
 from protocol.calls import Call, DoStep, GetOutputs
@@ -55,6 +59,7 @@ class DoubleStep(NamedTuple):
         comparison: values of the comparison solution at T_n + 2H, shape (m,).
         history: inputs at the communication points up to T_n + H.
         signals: the inputs of both small steps.
+        discrete: discrete outputs at T_n + H and T_n + 2H.
     """
 
     times: DoubleStepTimes
@@ -64,6 +69,7 @@ class DoubleStep(NamedTuple):
     comparison: FloatArray
     history: CouplingHistory
     signals: tuple[InputSignal, InputSignal]
+    discrete: tuple[DiscreteValues, DiscreteValues] = ((), ())
 
 
 class DoubleStepper:
@@ -87,14 +93,18 @@ class DoubleStepper:
         self._external = coupled.external
         self._scheme = scheme
         self._is_long_step = estimator.comparison is Comparison.LONG_STEP
-        self._requests = StepRequests(group, coupled, scheme)
+        self._requests = step_requests(group, coupled, scheme)
         solution = (scheme.get_outputs, scheme.output_rows)
         values_only = ([GetOutputs()] * len(coupled.parts), 1)
         self._solution = solution
         self._comparison = solution if scheme.known_ahead else values_only
 
     def attempt(
-        self, history: CouplingHistory, times: DoubleStepTimes, polynomials: Polynomials
+        self,
+        history: CouplingHistory,
+        times: DoubleStepTimes,
+        polynomials: Polynomials,
+        begin: Outputs = NO_OUTPUTS,
     ) -> DoubleStep | FailedStep:
         """One double step from the newest point of ``history``.
 
@@ -102,6 +112,7 @@ class DoubleStepper:
             history: inputs at the communication points up to T_n.
             times: of the double step.
             polynomials: of the inputs, for each kind.
+            begin: outputs at T_n, for the discrete inputs.
 
         Returns:
             The solution, or why there is none. Unless `accepted` follows, the next attempt goes
@@ -111,7 +122,7 @@ class DoubleStepper:
             DoublestepError: a slave is lost, or failed in a way that a smaller step cannot help.
         """
         try:
-            return self._attempt(history, times, polynomials)
+            return self._attempt(history, times, polynomials, begin)
         except BrokenOffError as broken_off:
             return broken_off.failed
         except StepRejectedError as error:  # of an external input, before anything was sent
@@ -122,9 +133,15 @@ class DoubleStepper:
         self._requests.forget()
 
     def _attempt(
-        self, history: CouplingHistory, times: DoubleStepTimes, polynomials: Polynomials
+        self,
+        history: CouplingHistory,
+        times: DoubleStepTimes,
+        polynomials: Polynomials,
+        outputs: Outputs,
     ) -> DoubleStep:
         begin, middle, end, first, second = times
+        discrete = self._coupled.discrete
+        held = discrete.held(outputs.y[0], outputs.d)
         external = self._external.over(begin, middle)
         external_second = self._external.over(middle, end)
         external_long = self._external.over(begin, end)
@@ -145,42 +162,50 @@ class DoubleStepper:
                 None,
                 inputs_of("long", past, end),
                 external_long,
+                held,
                 DoStep(begin, first + second, True),
                 *self._comparison,
             )
-            small_piece = Piece((RESTORE_POINT,), first_inputs, external, step, *self._solution)
-            comparison, y_middle = self._requests.take([comparison_piece, small_piece])
+            small_piece = Piece(
+                (RESTORE_POINT,), first_inputs, external, held, step, *self._solution
+            )
+            comparison, at_middle = self._requests.take([comparison_piece, small_piece])
             before_second: tuple[Call, ...] = ()
         else:
             past = history
-            small_piece = Piece(None, first_inputs, external, step, *self._solution)
+            small_piece = Piece(None, first_inputs, external, held, step, *self._solution)
             comparison_piece = Piece(
                 (SAVE_HALFWAY,),
                 lambda _: signals["first"].shifted(first).derivatives,
                 external_long.shifted(first),
+                held,
                 DoStep(middle, second, False),
                 *self._comparison,
             )
-            y_middle, comparison = self._requests.take([small_piece, comparison_piece])
+            at_middle, comparison = self._requests.take([small_piece, comparison_piece])
             before_second = (RESTORE_HALFWAY,)
 
+        y_middle = at_middle.y
+        d_middle = discrete.filled(at_middle.d, outputs.d)
         pushed = history.pushed(middle, self._coupled.inputs_of(y_middle))
         second_piece = Piece(
             before_second,
             inputs_of("second", pushed, end),
             external_second,
+            discrete.held(y_middle[0], d_middle),
             DoStep(middle, second, False),
             *self._solution,
         )
-        (y,) = self._requests.take([second_piece])
+        (at_end,) = self._requests.take([second_piece])
         return DoubleStep(
             times=times,
             polynomials=polynomials,
             middle=y_middle,
-            end=y,
-            comparison=comparison[0],
+            end=at_end.y,
+            comparison=comparison.y[0],
             history=pushed,
             signals=(signals["first"], signals["second"]),
+            discrete=(d_middle, discrete.filled(at_end.d, d_middle)),
         )
 
     def _signal(
@@ -191,3 +216,48 @@ class DoubleStepper:
         if ahead:
             history = history.pushed(time, self._coupled.inputs_of(known))
         return self._scheme.extrapolation.signal(history, polynomials, ahead)
+
+
+class PartialDoubleStepper(DoubleStepper):
+    """Takes the double steps of the slaves that can go back, where not all can.
+
+    Their inputs from the others have the polynomial through the communication points up to T_n in
+    all steps: no newer value is known, and the comparison solution cannot tell its error. Output
+    columns of the others are 0.
+
+    Args:
+        group: the slaves, at their first communication point.
+        coupled: their connections.
+        scheme: how they are coupled within a step.
+        estimator: which comparison solution to compute.
+    """
+
+    def __init__(
+        self,
+        group: SlaveGroup,
+        coupled: CoupledSystem,
+        scheme: CouplingScheme,
+        estimator: ErrorEstimator,
+    ) -> None:
+        super().__init__(group, coupled, scheme, estimator)
+        kinds = np.array([kind.late for kind in scheme.extrapolation.kinds])
+        self._late_inputs = np.flatnonzero(kinds[scheme.extrapolation.kind_of_input])
+
+    def _attempt(
+        self,
+        history: CouplingHistory,
+        times: DoubleStepTimes,
+        polynomials: Polynomials,
+        outputs: Outputs,
+    ) -> DoubleStep:
+        self._begin = times.begin
+        self._from_begin = self._scheme.extrapolation.signal(history, polynomials)
+        return super()._attempt(history, times, polynomials, outputs)
+
+    def _signal(
+        self, history: CouplingHistory, polynomials: Polynomials, time: float, known: FloatArray
+    ) -> InputSignal:
+        derivatives = super()._signal(history, polynomials, time, known).derivatives
+        late = self._from_begin.shifted(history.times[0] - self._begin).derivatives
+        derivatives[:, self._late_inputs] = late[:, self._late_inputs]
+        return InputSignal(derivatives)

@@ -53,6 +53,9 @@ class ErrorControl:
         scheme: how its slaves are coupled.
         estimator: EST_Rich or EST_mod.
         constants: ``exact`` or ``paper``, see ``numerics/error_estimators.py``.
+
+    Attributes:
+        outputs: how many outputs ERR is the mean of.
     """
 
     def __init__(
@@ -62,6 +65,7 @@ class ErrorControl:
         estimator: ErrorEstimator,
         constants: str,
     ) -> None:
+        self.outputs = len(coupled.output_names)
         self._names = coupled.output_names
         self._absolute_tolerance = coupled.absolute_tolerance
         self._relative_tolerance = coupled.relative_tolerance
@@ -92,14 +96,16 @@ class ErrorControl:
         """EST and ERR of a double step."""
         y = step.end[0]
         error = self._estimate(y, step.comparison, self._ratios(step))
-        norm, index = weighted_rms_norm(
-            error, y, self._absolute_tolerance, self._relative_tolerance
-        )
+        norm, index = self._norm(error, y)
         limiting = self._names[index]
         bad = first_not_finite(step.end)
         if bad is not None:
             return StepError(error, _INF, f"{self._names[bad]} is not finite")
         return StepError(error, norm, limiting)
+
+    def _norm(self, error: FloatArray, y: FloatArray) -> tuple[float, int]:
+        """ERR, and the index of the output with most of it."""
+        return weighted_rms_norm(error, y, self._absolute_tolerance, self._relative_tolerance)
 
     def weights(self, y: FloatArray) -> FloatArray:
         """1 / (ATOL_j + RTOL_j |y_j|) of equation (8), shape (m,)."""
@@ -159,3 +165,47 @@ class ErrorControl:
             for i in kinds
         ]
         return min(candidates, key=lambda p: abs(1.0 - p), default=2.0)
+
+
+class PartialErrorControl(ErrorControl):
+    """The same over the outputs of the slaves that take double steps, where not all do.
+
+    The others have not taken their steps when a double step is judged: their outputs do not count,
+    and have the weight 0.
+
+    Args:
+        coupled: the system, with its tolerances.
+        scheme: how its slaves are coupled.
+        estimator: EST_Rich or EST_mod.
+        constants: ``exact`` or ``paper``.
+    """
+
+    def __init__(
+        self,
+        coupled: CoupledSystem,
+        scheme: CouplingScheme,
+        estimator: ErrorEstimator,
+        constants: str,
+    ) -> None:
+        super().__init__(coupled, scheme, estimator, constants)
+        takes_part = ~np.isin(coupled.output_slave, scheme.late_slaves)
+        self._counted = np.flatnonzero(takes_part)
+        self._counts = takes_part.astype(float)
+        self.outputs = len(self._counted)
+
+    def weights(self, y: FloatArray) -> FloatArray:
+        """See `ErrorControl`; 0 for outputs that do not count."""
+        weights: FloatArray = super().weights(y) * self._counts
+        return weights
+
+    def _norm(self, error: FloatArray, y: FloatArray) -> tuple[float, int]:
+        counted = self._counted
+        if not counted.size:
+            return 0.0, 0
+        norm, index = weighted_rms_norm(
+            error[counted],
+            y[counted],
+            self._absolute_tolerance[counted],
+            self._relative_tolerance[counted],
+        )
+        return norm, int(counted[index])

@@ -11,11 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from master_node.configuration import System
-from master_node.discrete_coupling import DiscreteValues, HeldInput
+from master_node.discrete_coupling import DiscreteValues, Held, HeldInput
 from master_node.numerics.fixed_point import NoFixedPointError, fixed_point
 from master_node.outputs import Outputs, gather
 from master_node.slave_group import Program, SlaveGroup
 from master_node.start_values import start_values
+from master_node.step_size_rules import step_size_limits
 from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import (
     ExitInitializationMode,
@@ -27,7 +28,7 @@ from protocol.calls import (
 )
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
-from protocol.slave import StartValue
+from protocol.slave import StartValue, StateKind
 
 _LOOP_ROUNDS = 100
 _LOOP_TOLERANCE = 1e-12
@@ -57,7 +58,10 @@ def initialize(
     """
     simulation = system.simulation
     start = float(simulation.start_time)
-    group.execute_all([(_initialize(part, system),) for part in coupled.parts], start)
+    may_return_early = simulation.estimator != "none" and step_size_limits(system).quantum is None
+    group.execute_all(
+        [(_initialize(part, system, may_return_early),) for part in coupled.parts], start
+    )
     _InitializationMode(group, coupled, start).propagate()
     get_outputs = get_outputs or [GetOutputs()] * len(coupled.parts)
     programs = [
@@ -73,7 +77,8 @@ def initialize(
     return outputs
 
 
-def _initialize(part: SlavePart, system: System) -> Initialize:
+def _initialize(part: SlavePart, system: System, may_return_early: bool) -> Initialize:
+    """What a slave is told; it returns early at an event only if it can go back before it."""
     simulation = system.simulation
     return Initialize(
         start_time=float(simulation.start_time),
@@ -85,6 +90,7 @@ def _initialize(part: SlavePart, system: System) -> Initialize:
         outputs=part.outputs,
         discrete_inputs=part.discrete_inputs,
         discrete_outputs=part.discrete_outputs,
+        early_return=may_return_early and part.description.state_kind is not StateKind.NONE,
     )
 
 
@@ -121,7 +127,7 @@ class _InitializationMode:
         def again(y: FloatArray) -> FloatArray:
             nonlocal outputs
             outputs = self._round(
-                self._inputs(coupled.inputs_of(y), self._discrete_inputs(Outputs(y, outputs.d)))
+                self._inputs(coupled.inputs_of(y), self._coupled.discrete.held(y, outputs.d))
             )
             values: FloatArray = outputs.y[0]
             return values
@@ -148,14 +154,15 @@ class _InitializationMode:
             return ()
         return (SetInputs(part.columns(starts[np.newaxis], self._external)),)
 
-    def _inputs(self, u: FloatArray, d: Sequence[DiscreteValues]) -> list[Program]:
+    def _inputs(self, u: FloatArray, d: Held) -> list[Program]:
         """The calls that set all inputs of each slave."""
+        d = d or ((),) * len(self._coupled.parts)
         return [
             (SetInputs(part.columns(u[np.newaxis], self._external)), *_discrete(values))
             for part, values in zip(self._coupled.parts, d, strict=True)
         ]
 
-    def _known_discrete_inputs(self, outputs: Outputs, level: int) -> list[DiscreteValues]:
+    def _known_discrete_inputs(self, outputs: Outputs, level: int) -> Held:
         """The discrete inputs, with start values for those whose outputs are of higher levels."""
         order, discrete = self._coupled.initialization, self._coupled.discrete
 
@@ -168,14 +175,7 @@ class _InitializationMode:
                 return held.start
             return held.value(outputs.y[0], outputs.d)
 
-        return [tuple(map(value, inputs)) for inputs in discrete.inputs]
-
-    def _discrete_inputs(self, outputs: Outputs) -> list[DiscreteValues]:
-        discrete = self._coupled.discrete
-        return [
-            discrete.inputs_of(slave, outputs.y, outputs.d)
-            for slave in range(len(self._coupled.parts))
-        ]
+        return tuple(tuple(map(value, inputs)) for inputs in discrete.inputs)
 
     def _round(self, programs: Sequence[Program]) -> Outputs:
         """Execute these calls and read all outputs."""

@@ -6,12 +6,36 @@ that raises ends the run with that error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from protocol.signals import FloatArray
+
+DiscreteType = Literal["float", "integer", "boolean", "string", "binary"]
+"""What a discrete variable holds: FMI's Real, Integer or Enumeration, Boolean, String, Binary."""
+
+DiscreteValue = float | int | bool | str | bytes
+"""A value of one of these types, in their order. An ``integer`` has 64 bits and a sign."""
+
+
+class OutputControl(NamedTuple):
+    """Which outputs are controlled how, as ``slave.variable``; both may be said of one.
+
+    Attributes:
+        double_step: those whose error is estimated with a comparison solution, before the double
+            step is accepted.
+        input_defects: those of slaves without rollback and of slaves that get inputs from such:
+            the defects of these inputs are known after the step, and bound the next one.
+    """
+
+    double_step: tuple[str, ...] = ()
+    input_defects: tuple[str, ...] = ()
+
+
+NOT_CONTROLLED = OutputControl()
+"""Without an estimator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +47,13 @@ class RunStart:
         output_units: their units, "" where none.
         start_time, stop_time: [s].
         outputs: y(T_0), shape (m,).
+        control: how the outputs are controlled.
+        state_kinds: how the state of each slave is saved, by its name.
+        discrete_names: ``slave.variable`` of the d variables beside the outputs that do not
+            change continuously, in the order of all tuples of discrete values.
+        discrete_types: what they hold, d of them.
+        discrete_units: their units, "" where none; empty when none has one.
+        discrete: their values at T_0, d of them.
     """
 
     output_names: tuple[str, ...]
@@ -30,10 +61,30 @@ class RunStart:
     start_time: float
     stop_time: float
     outputs: FloatArray
+    discrete_names: tuple[str, ...] = ()
+    discrete_types: tuple[DiscreteType, ...] = ()
+    discrete_units: tuple[str, ...] = ()
+    discrete: tuple[DiscreteValue, ...] = ()
+    control: OutputControl = NOT_CONTROLLED
+    state_kinds: Mapping[str, str] = field(default_factory=dict)
 
 
-Points = tuple[tuple[float, FloatArray], ...]
-"""Times [s] and the outputs there, shape (m,) each."""
+class Point(NamedTuple):
+    """Where a result is wanted.
+
+    Attributes:
+        time: [s].
+        outputs: y there, shape (m,).
+        discrete: values of the d discrete variables there.
+    """
+
+    time: float
+    outputs: FloatArray
+    discrete: tuple[DiscreteValue, ...] = ()
+
+
+Points = tuple[Point, ...]
+"""In the order of time."""
 
 
 class Attempt(NamedTuple):
@@ -94,6 +145,8 @@ class Statistics:
         wall_time: seconds of the whole stepping phase.
         discontinuities: how many were found or declared.
         double_steps_at_discontinuities: attempts spent on finding and crossing them.
+        steps_above_tolerance: double steps, or single ones where no slave has rollback, that had
+            ERR above 1 when it was too late to reject them.
         time: the last accepted communication point [s].
         smallest_step_size, largest_step_size: over accepted steps [s]; NaN before the first.
     """
@@ -102,6 +155,7 @@ class Statistics:
     rejected_double_steps: int = 0
     discontinuities: int = 0
     double_steps_at_discontinuities: int = 0
+    steps_above_tolerance: int = 0
     round_trips: int = 0
     wait_time: float = 0.0
     wall_time: float = 0.0
@@ -113,11 +167,19 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class RunEnd:
-    """How it went. ``message`` is the error's or the slave's text, "" when completed."""
+    """How it went.
+
+    Attributes:
+        outcome: how the run ended.
+        statistics: counters of the run.
+        message: the error's or the slave's text, "" when completed.
+        points: results that are wanted after all, behind those of the last attempt.
+    """
 
     outcome: Outcome
     statistics: Statistics
     message: str = ""
+    points: Points = ()
 
 
 class Observer(Protocol):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from master_node.coupling_scheme import CouplingScheme
@@ -14,9 +16,11 @@ from master_node.numerics.error_estimators import (
 )
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial, Nodes, Polynomials
 from master_node.numerics.order_control import (
+    NO_BOUNDS,
     Candidate,
     Choice,
     OrderMemory,
+    beginning,
     choose,
     input_magnitudes,
     ladder,
@@ -74,10 +78,7 @@ class OrderSelection:
 
     def restart(self) -> OrderMemory:
         """The polynomial to begin with, where only one communication point says anything."""
-        polynomial = self._ladder[0]
-        if self._ladder[1].derivative_points:
-            polynomial = self._ladder[1]
-        return OrderMemory(polynomial)
+        return OrderMemory(beginning(self._ladder))
 
     def choose(
         self, memory: OrderMemory, step: DoubleStep, error: StepError, history: CouplingHistory
@@ -93,7 +94,6 @@ class OrderSelection:
         coupled = self._coupled
         slaves = len(coupled.parts)
         weights = self._control.weights(step.end[0])
-        outputs = len(coupled.output_names)
         squares = np.bincount(coupled.output_slave, np.square(error.estimate * weights), slaves)
         magnitudes = input_magnitudes(
             history,
@@ -112,7 +112,7 @@ class OrderSelection:
             middle=middle - begin,
             end=end - begin,
         )
-        points = self._estimator.available(len(history.times))
+        points = self._points(history)
         candidates = [
             self._next(polynomial, points, history, step_size)
             for polynomial in self._ladder
@@ -124,10 +124,24 @@ class OrderSelection:
             candidates,
             magnitudes,
             taken=taken,
-            error=np.sqrt(squares / outputs),
+            error=np.sqrt(squares / self._control.outputs),
             step_size=step_size,
             alpha=self._alpha,
+            bounds=self._bounds(candidates, history, step),
         )
+
+    def _points(self, history: CouplingHistory) -> int:
+        """Through how many points of ``history`` the next polynomials can go."""
+        return self._estimator.available(len(history.times))
+
+    def _bounds(
+        self,
+        candidates: Sequence[Candidate],  # noqa: ARG002  for systems with more to consider
+        history: CouplingHistory,  # noqa: ARG002
+        step: DoubleStep,  # noqa: ARG002
+    ) -> Mapping[InputPolynomial, float]:
+        """What bounds H over the present H, apart from the estimated error."""
+        return NO_BOUNDS
 
     def _is_possible(self, polynomial: InputPolynomial, points: int) -> bool:
         """Whether all inputs can have its degree, but for those whose slaves never can."""

@@ -26,6 +26,10 @@ class Outputs(NamedTuple):
     d: DiscreteValues = ()
 
 
+NO_OUTPUTS = Outputs(np.zeros((1, 0)))
+"""Of a system without discrete variables, where those at the beginning of a step are not needed."""
+
+
 def gather(coupled: CoupledSystem, replies: Sequence[Reply], rows: int = 1) -> Outputs:
     """The outputs at the end of each reply: of `GetOutputs`, then of `GetDiscreteOutputs`.
 

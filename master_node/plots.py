@@ -38,7 +38,8 @@ def plot_result(
 ) -> Figure:
     """Draw a result.
 
-    Outputs share a panel by unit where units are known, else by slave. Large results are drawn
+    Outputs share a panel by unit where units are known, else by slave. Discrete variables keep
+    their value up to the next point; texts and binary values are not drawn. Large results are drawn
     by their first, last, smallest and largest value in each column of pixels.
 
     Args:
@@ -48,10 +49,10 @@ def plot_result(
         variables: names to draw; None draws all, as far as there is room for them.
 
     Raises:
-        KeyError: no such variable.
+        KeyError: no such variable, or one that holds no numbers.
         ResultsError: the file cannot be written.
     """
-    panels = _panels(result, result.names if variables is None else variables)
+    panels = _panels(result, _drawable(result) if variables is None else variables)
     shown = panels[:_OUTPUT_PANELS] if variables is None else panels
     steps = result.steps
     has_norms = bool(len(steps)) and not bool(np.isnan(steps["error_norm"]).all())
@@ -106,11 +107,16 @@ def decimated(time: FloatArray, values: FloatArray, columns: int = _COLUMNS) -> 
     return np.unique(np.concatenate([starts, stops - 1, smallest, largest]))
 
 
+def _drawable(result: Result) -> list[str]:
+    return [name for name in result if result[name].dtype.kind != "O"]
+
+
 def _panels(result: Result, names: Sequence[str]) -> list[list[str]]:
     """Names by unit, by slave where no unit is known; as many to a panel as colours."""
     groups: dict[tuple[str, str], list[str]] = {}
     for name in names:
-        result[name]  # an unknown name is an error here
+        if result[name].dtype.kind == "O":  # an unknown name is an error here, too
+            raise KeyError(f"{name} holds no numbers")
         unit = result.units.get(name, "")
         key = (unit, "") if unit else ("", name.split(".", 1)[0])
         groups.setdefault(key, []).append(name)
@@ -158,11 +164,18 @@ def _save(figure: Figure, path: Path) -> None:
 
 def _draw_outputs(axes: Axes, result: Result, names: Sequence[str]) -> None:
     for name in names:
-        values = np.where(np.isfinite(result[name]), result[name], np.nan)
+        values = result[name].astype(np.float64)
+        values = np.where(np.isfinite(values), values, np.nan)
         values = np.clip(values, -_LARGEST, _LARGEST)
         kept = decimated(result.time, values)
         marker = "." if len(result.time) < 2 else ""
-        axes.plot(result.time[kept], values[kept], linewidth=1.3, marker=marker)
+        axes.plot(
+            result.time[kept],
+            values[kept],
+            drawstyle="steps-post" if name in result.discrete else "default",
+            linewidth=1.3,
+            marker=marker,
+        )
     unit = result.units.get(names[0], "")
     axes.set_ylabel(f"[{_shortened(unit)}]" if unit else _shortened(names[0].split(".", 1)[0]))
     _legend(axes, names)

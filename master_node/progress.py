@@ -126,6 +126,7 @@ _FACTS = (
     ("round_trips", "round trips", ""),
 )
 _PER_SLAVE = (
+    ("state_kind", "state"),
     ("do_steps", "do_steps"),
     ("rollbacks", "rollbacks"),
     ("requests", "requests"),
@@ -143,6 +144,8 @@ def summary_table(result_summary: Mapping[str, Any]) -> Table:
         if value not in (None, ""):
             style = _outcome_style(value) if key == "outcome" else ""
             facts.add_row(label, Text(_text(value) + unit, style))
+    for label, text in _control(result_summary):
+        facts.add_row(label, Text(text))
     parts: list[RenderableType] = [facts]
     per_slave = [(result_summary.get(key) or {}, label) for key, label in _PER_SLAVE]
     names = dict.fromkeys(name for values, _ in per_slave for name in values)
@@ -157,6 +160,22 @@ def summary_table(result_summary: Mapping[str, Any]) -> Table:
     for part in parts:
         table.add_row(part)
     return table
+
+
+def _control(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Labels and texts on which outputs are controlled how, where not all are in one way."""
+    controlled_by = summary.get("controlled_by") or {}
+    if not controlled_by.get("input_defects"):
+        return []
+    rows = [
+        (label, ", ".join(controlled_by[key]))
+        for key, label in (
+            ("double_step", "controlled by double steps"),
+            ("input_defects", "controlled by input defects"),
+        )
+        if controlled_by.get(key)
+    ]
+    return [*rows, ("steps above tolerance", _text(summary.get("steps_above_tolerance", "")))]
 
 
 def _outcome_style(outcome: object) -> str:

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from master_node.discrete_coupling import DiscreteValues
 from master_node.numerics.dense_output import OutputGrid, OutputHistory
-from master_node.observers import Points, Statistics
+from master_node.observers import Point, Points, Statistics
+from master_node.outputs import Outputs
 from protocol.signals import FloatArray
 
-Reached = tuple[tuple[float, FloatArray], ...]
-"""Communication points [s] and the outputs there, shape (rows, m) each."""
+
+class ReachedPoint(NamedTuple):
+    """A communication point that was reached.
+
+    Attributes:
+        time: [s].
+        y: outputs there, shape (rows, m).
+        d: discrete outputs there.
+    """
+
+    time: float
+    y: FloatArray
+    d: DiscreteValues = ()
+
+
+Reached = tuple[ReachedPoint, ...]
+"""In the order of time."""
 
 
 class ResultPoints:
@@ -20,15 +40,20 @@ class ResultPoints:
         grid: where results are wanted; None: at the communication points.
         has_derivative: which outputs come with their derivatives, shape (m,).
         time: T_0 [s].
-        y: outputs there, shape (rows, m).
+        outputs: there.
     """
 
     def __init__(
-        self, grid: OutputGrid | None, has_derivative: NDArray[np.bool_], time: float, y: FloatArray
+        self,
+        grid: OutputGrid | None,
+        has_derivative: NDArray[np.bool_],
+        time: float,
+        outputs: Outputs,
     ) -> None:
         self._grid = grid
         self._has_derivative = has_derivative
-        self._history = OutputHistory((time,), (y,))
+        self._history = OutputHistory((time,), (outputs.y,))
+        self._d = outputs.d
         self._number = 1
 
     def reached(self, reached: Reached, order: int) -> Points:
@@ -40,24 +65,37 @@ class ResultPoints:
         """
         if self._grid is None:
             return _values(reached)
-        for time, y in reached:
-            self._history = self._history.pushed(time, y)
-        times = self._wanted(self._grid, reached[-1][0])
+        for point in reached:
+            self._history = self._history.pushed(point.time, point.y)
+        times = self._wanted(self._grid, reached[-1].time)
+        held = self._held(times, reached)
         if not times:
             return ()
         values = self._history.at(np.array(times), order, self._has_derivative)
-        return tuple(zip(times, values, strict=True))
+        return tuple(map(Point, times, values, held))
 
     def jumped(self, reached: Reached) -> Points:
         """The same for points that lead over a discontinuity: nothing smooth lies between them."""
-        time, y = reached[-1]
+        time, y, _ = reached[-1]
         self._history = OutputHistory((time,), (y,))
         if self._grid is None:
             return _values(reached)
-        return tuple(
-            (wanted, next(y[0] for point, y in reached if point >= wanted))
-            for wanted in self._wanted(self._grid, time)
-        )
+        times = self._wanted(self._grid, time)
+        behind = [next(point.y[0] for point in reached if point.time >= t) for t in times]
+        return tuple(map(Point, times, behind, self._held(times, reached)))
+
+    def cut(self, point: ReachedPoint) -> None:
+        """Forget what was before: nothing smooth leads over ``point``."""
+        self._history = OutputHistory((point.time,), (point.y,))
+
+    def _held(self, times: Sequence[float], reached: Reached) -> list[DiscreteValues]:
+        """Discrete outputs at ``times``: what they were at the communication point before."""
+        held = []
+        for time in times:
+            passed = [point.d for point in reached if point.time <= time]
+            held.append(passed[-1] if passed else self._d)
+        self._d = reached[-1].d
+        return held
 
     def _wanted(self, grid: OutputGrid, end: float) -> list[float]:
         times = grid.up_to(end, self._number)
@@ -66,13 +104,13 @@ class ResultPoints:
 
 
 def _values(reached: Reached) -> Points:
-    return tuple((time, y[0]) for time, y in reached)
+    return tuple(Point(time, y[0], d) for time, y, d in reached)
 
 
 def count_accepted(statistics: Statistics, step_size: float, reached: Reached) -> None:
     """Note accepted communication steps of ``step_size`` H [s]."""
     statistics.communication_steps += len(reached)
-    statistics.time = reached[-1][0]
+    statistics.time = reached[-1].time
     if not step_size >= statistics.smallest_step_size:
         statistics.smallest_step_size = step_size
     if not step_size <= statistics.largest_step_size:

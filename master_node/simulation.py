@@ -13,7 +13,13 @@ from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.configuration import InputSettings, System
 from master_node.input_loading import load_signals
 from master_node.observers import Observer, Observers
-from master_node.results import Recording, Result, ResultsWriter
+from master_node.results import (
+    Recording,
+    Result,
+    ResultsWriter,
+    SelectedResults,
+    check_variables,
+)
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
 from master_node.step_size_rules import check_step_sizes
@@ -53,7 +59,8 @@ def simulate(
         directory,
         in_process=in_process,
         launch=launch,
-        observers=(recording, *observers),
+        observers=observers,
+        recording=recording,
     )
     return recording.result()
 
@@ -65,21 +72,36 @@ def run(
     in_process: bool = False,
     launch: bool = True,
     observers: Sequence[Observer] = (),
+    recording: Recording | None = None,
 ) -> None:
-    """Run a system, streaming into ``directory`` if one is given; raises as `simulate`."""
+    """Run a system; raises as `simulate`.
+
+    Args:
+        system: slaves, connections and settings.
+        directory: where results are streamed to; None: nowhere.
+        in_process: run the slaves in this process, without a bus.
+        launch: start slaves that have a model; False: find all of them on the bus.
+        observers: are told of everything that happens.
+        recording: is told of the results that the system asks for, as the files are.
+    """
     settings = settings_of(system, {})
     check_step_sizes(system)
     signals = load_signals(system)
-    writer = None if directory is None else ResultsWriter(directory, settings)
-    if writer is not None:
-        writer.prepare()
+    if directory is not None:
+        ResultsWriter(directory, settings).prepare()
     with _slaves(system, directory, in_process=in_process, launch=launch) as slaves:
         coupled = resolve(system, slaves.descriptions, signals)
         for warning in check_capabilities(coupled, system):
             log.warning("%s", warning)
+        wanted = system.results
+        check_variables(
+            wanted.variables, (*coupled.output_names, *coupled.discrete.names), system.source
+        )
+        keepers: list[Observer] = [] if recording is None else [recording]
         if directory is not None:
-            writer = ResultsWriter(directory, settings_of(system, slaves.descriptions))
-        observer = Observers([*observers, writer] if writer is not None else observers)
+            keepers.append(ResultsWriter(directory, settings_of(system, slaves.descriptions)))
+        selected = SelectedResults(Observers(keepers), wanted.variables, wanted.every)
+        observer = Observers([*observers, selected])
         CoSimulation(SlaveGroup(slaves.links), coupled, system, observer).run()
 
 

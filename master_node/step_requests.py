@@ -6,16 +6,18 @@ time; the groups of a Gauss-Seidel sequence follow each other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from master_node.coupling_scheme import CouplingScheme
+from master_node.discrete_coupling import DiscreteValues, Held
 from master_node.external_inputs import ExternalSignal
 from master_node.numerics.norms import first_not_finite
 from master_node.output_evaluation import OutputEvaluation
+from master_node.outputs import Outputs
 from master_node.slave_group import Program, SlaveGroup
 from master_node.system import CoupledSystem
 from protocol.calls import (
@@ -51,6 +53,8 @@ class FailedStep:
         reached: which part of its step the slave completed, 0 to 1; NaN when unknown.
         reason: for ``steps.csv`` and messages: a variable or a slave, and what happened.
         error: of the slave, if it returned one.
+        step: that was not completed; None when it was a value that is not finite.
+        time: where the slave stands [s]; NaN when unknown.
     """
 
     slave: str
@@ -58,6 +62,8 @@ class FailedStep:
     reached: float
     reason: str
     error: DoublestepError | None = None
+    step: DoStep | None = None
+    time: float = float("nan")
 
 
 Inputs = Callable[[FloatArray], FloatArray]
@@ -72,6 +78,7 @@ class Piece(NamedTuple):
         before: what each slave does first: save or restore; None: what the last attempt calls for.
         inputs: see `Inputs`.
         external: the external inputs in it.
+        held: the discrete inputs in it.
         step: the same for all slaves.
         get_outputs: for each slave.
         rows: of its output arrays.
@@ -80,6 +87,7 @@ class Piece(NamedTuple):
     before: tuple[Call, ...] | None
     inputs: Inputs
     external: ExternalSignal
+    held: Held
     step: DoStep
     get_outputs: Sequence[GetOutputs]
     rows: int
@@ -115,21 +123,22 @@ class StepRequests:
         """The state saved at T_n is not needed any more: it is saved anew where a step begins."""
         self._saved = [False] * len(self._columns)
 
-    def take(self, pieces: Sequence[Piece]) -> list[FloatArray]:
+    def take(self, pieces: Sequence[Piece]) -> list[Outputs]:
         """Take steps from where the slaves stand.
 
         Returns:
-            The outputs at the end of each piece, shape (rows, m).
+            The outputs at the end of each piece, those of continuous variables of shape (rows, m).
 
         Raises:
             BrokenOffError: a slave did not get to the end, or an output there is not finite.
         """
         outputs = [np.zeros((piece.rows, len(self._names))) for piece in pieces]
         if not self._evaluation.is_needed:
-            self._request(pieces, outputs)
-            return outputs
+            discrete = self._request(pieces, outputs)
+            return list(map(Outputs, outputs, discrete))
+        discrete = []
         for piece, y in zip(pieces, outputs, strict=True):
-            self._request([piece], [y])
+            discrete += self._request([piece], [y])
             step = piece.step
             try:
                 self._evaluation.evaluate(
@@ -138,15 +147,18 @@ class StepRequests:
             except StepRejectedError as error:
                 failed = FailedStep("", None, float("nan"), error.cause, error)
                 raise BrokenOffError(failed) from None
-        return outputs
+        return list(map(Outputs, outputs, discrete))
 
-    def _request(self, pieces: Sequence[Piece], outputs: Sequence[FloatArray]) -> None:
-        """One request to each slave, group after group; fills ``outputs`` of each piece."""
-        places = []
-        length = 0
-        for piece in pieces:
-            length += (1 if piece.before is None else len(piece.before)) + 3
-            places.append(length - 1)
+    def _request(
+        self, pieces: Sequence[Piece], outputs: Sequence[FloatArray]
+    ) -> list[DiscreteValues]:
+        """One request to each slave, group after group; fills ``outputs`` of each piece.
+
+        Returns:
+            The discrete outputs of each piece.
+        """
+        places = self._places(pieces)
+        answers: dict[int, list[object]] = {}
         for slaves in self._scheme.groups:
             inputs = [piece.inputs(y) for piece, y in zip(pieces, outputs, strict=True)]
             programs = [self._program(slave, pieces, inputs) for slave in slaves]
@@ -156,14 +168,33 @@ class StepRequests:
             self._check(slaves, programs, replies)
             for slave, reply in zip(slaves, replies, strict=True):
                 columns = self._output_slices[slave]
-                for y, place in zip(outputs, places, strict=True):
-                    values: Any = reply.results[place]
+                answers[slave] = results = reply.results
+                for y, place in zip(outputs, places[slave], strict=True):
+                    values: Any = results[place]
                     y[: len(values), columns] = values
             for y in outputs:
                 bad = first_not_finite(y)
                 if bad is not None:  # before anyone else gets it
                     reason = f"{self._names[bad]} is not finite"
                     raise BrokenOffError(FailedStep("", None, float("nan"), reason))
+        return self._discrete_outputs(answers, places)
+
+    def _places(self, pieces: Sequence[Piece]) -> Sequence[Sequence[int]]:
+        """For each slave where the outputs of each piece are in its reply."""
+        places = []
+        length = 0
+        for piece in pieces:
+            length += (1 if piece.before is None else len(piece.before)) + 3
+            places.append(length - 1)
+        return [places] * len(self._columns)
+
+    def _discrete_outputs(
+        self,
+        answers: Mapping[int, list[object]],  # noqa: ARG002  all is continuous
+        places: Sequence[Sequence[int]],
+    ) -> list[DiscreteValues]:
+        """Those of each piece, from the results of each slave that was asked."""
+        return [()] * len(places[0])
 
     def _program(
         self, slave: int, pieces: Sequence[Piece], inputs: Sequence[FloatArray]
@@ -214,4 +245,5 @@ def _failure(slave: str, program: Program, reply: Reply) -> FailedStep:
     assert isinstance(call, DoStep)
     assert isinstance(result, StepResult)
     reached = (result.time - call.communication_point) / call.step_size
-    return FailedStep(slave, result.status, reached, f"{slave}: {result.status}")
+    reason = f"{slave}: {result.status}"
+    return FailedStep(slave, result.status, reached, reason, step=call, time=result.time)

@@ -71,6 +71,14 @@ def quarter_car_ssp(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def capability_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the FMUs of all capabilities."""
+    folder = tmp_path_factory.mktemp("capabilities")
+    _example("capabilities", "build").build(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
 def oscillators() -> ModuleType:
     """The reference solutions of the oscillators."""
     return _example("oscillators", "oscillators")

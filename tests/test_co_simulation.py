@@ -541,21 +541,10 @@ def test_a_slave_that_takes_no_derivatives_gets_order_0(estimator: str, k: int) 
         assert global_errors(result).max() < 5e-3
 
 
-@pytest.mark.parametrize(
-    ("missing", "words"),
-    [
-        ("can_get_and_set_state", "wheel: the model cannot save and restore its state"),
-        ("can_handle_variable_step_size", "wheel: the model cannot handle variable"),
-    ],
-)
-def test_what_step_size_control_needs_is_checked_before_the_run(missing: str, words: str) -> None:
+def test_what_step_size_control_needs_is_checked_before_the_run() -> None:
     """Named with the slave, and with the remedy, which works."""
-    can = {
-        "can_get_and_set_state": True,
-        "can_handle_variable_step_size": True,
-        "can_interpolate_inputs": True,
-    }
-    simple = Capabilities(**can | {missing: False})
+    words = "wheel: the model cannot handle variable"
+    simple = Capabilities(can_get_and_set_state=True, can_interpolate_inputs=True)
     slaves = {"chassis": CHASSIS.slave(), "wheel": WHEEL.slave(capabilities=simple)}
     with pytest.raises(ConfigurationError, match=f"{words}.*--estimator none"):
         run_slaves(car(), slaves)

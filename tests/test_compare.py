@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from master_node.compare import compare
+from master_node.observers import Attempt, Outcome, Point, RunEnd, RunStart, Statistics
+from master_node.results import ResultsWriter
 from protocol.errors import ResultsError
 
 Columns = Mapping[str, Sequence[float]]
@@ -180,3 +182,56 @@ def test_what_cannot_be_compared_says_why(write: Write) -> None:
     between = write("b", {"time": [0.25, 0.75], "s.x": [0.0, 0.0]})
     with pytest.raises(ResultsError, match=r"no point from 0\.25 to 0\.75 s"):
         compare(a, between, 0.0, 0.0)
+
+
+def write_discrete(
+    directory: Path, times: Sequence[float], gears: Sequence[int], label: str = "a"
+) -> Path:
+    """A results directory in Arrow with discrete variables of three types."""
+    start = RunStart(
+        ("s.x",),
+        ("m",),
+        times[0],
+        9.0,
+        np.zeros(1),
+        ("s.gear", "s.ratio", "s.label"),
+        ("integer", "float", "string"),
+        (),
+        (gears[0], float(gears[0]), label),
+    )
+    writer = ResultsWriter(directory, {"results": {"formats": ["arrow"]}})
+    writer.started(start)
+    for time, gear in zip(times[1:], gears[1:], strict=True):
+        point = Point(time, np.zeros(1), (gear, gear + 1e-6, label))
+        writer.attempted(Attempt(0.0, 0.1, 0, 0, 0.5, True, "", (point,)))
+    writer.ended(RunEnd(Outcome.COMPLETED, Statistics()))
+    return directory
+
+
+def test_discrete_variables_keep_their_value_up_to_the_next_point(tmp_path: Path) -> None:
+    """Between the points of b nothing is interpolated; floats have tolerances, the others none."""
+    b = write_discrete(tmp_path / "b", [0.0, 1.0, 2.0], [1, 2, 3])
+    a = write_discrete(tmp_path / "a", [0.0, 0.5, 1.0, 1.5, 2.0], [1, 1, 2, 2, 3])
+    comparison = compare(a, b, 0.0, 1e-3)
+    assert comparison.within_tolerance
+    assert comparison.interpolated_points == 2
+    names = ["s.x", "s.gear", "s.ratio", "s.label"]
+    assert [variable.name for variable in comparison.variables] == names
+    late = write_discrete(tmp_path / "late", [0.0, 0.5, 1.0, 1.5, 2.0], [1, 1, 1, 2, 3])
+    x, gear, ratio, label = compare(late, b, 0.0, 10.0).variables
+    assert (gear.within_tolerance, gear.largest_difference, gear.time) == (False, 1.0, 1.0)
+    assert x.within_tolerance
+    assert ratio.within_tolerance
+    assert label.within_tolerance
+
+
+def test_texts_are_equal_or_not(tmp_path: Path) -> None:
+    """A text differs by 1, and that is never within tolerance; equal bits mean equal texts, too."""
+    a = write_discrete(tmp_path / "a", [0.0, 1.0], [1, 1])
+    same = write_discrete(tmp_path / "same", [0.0, 1.0], [1, 1])
+    other = write_discrete(tmp_path / "other", [0.0, 1.0], [1, 1], "b")
+    assert compare(a, same, 0.0, 0.0).equal_bits
+    comparison = compare(a, other, 0.0, 10.0)
+    assert not comparison.equal_bits
+    label = comparison.variables[-1]
+    assert (label.name, label.largest_difference, label.within_tolerance) == ("s.label", 1.0, False)

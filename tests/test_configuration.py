@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master_node import BusSettings, SimulationSettings, System, load_system
+from master_node import BusSettings, ResultsSettings, SimulationSettings, System, load_system
 from master_node.configuration import OutputTolerance, SlaveSettings
 from master_node.numerics.extrapolation import InputPolynomial
 from master_node.simulation import settings_of
@@ -119,6 +119,11 @@ def test_a_file_is_read_as_it_is_written(tmp_path: Path) -> None:
     from = "a.x"
     to = "b.c.y"
 
+    [results]
+    variables = ["a.*", "!a.z"]
+    every = 10
+    formats = ["arrow", "parquet", "mat", "csv"]
+
     [bus]
     listen = ["tcp/127.0.0.1:7447"]
     connect = ["tcp/127.0.0.1:7448"]
@@ -170,6 +175,9 @@ def test_a_file_is_read_as_it_is_written(tmp_path: Path) -> None:
     parameters = system.slaves["a"].parameters
     assert [type(value) for value in parameters.values()] == [float, int, bool, str]
     assert [(c.source, c.target) for c in system.connections] == [("a.x", "b.c.y")]
+    assert system.results == ResultsSettings(
+        variables=("a.*", "!a.z"), every=10, formats=("arrow", "parquet", "mat", "csv")
+    )
     assert system.bus == BusSettings(
         listen=("tcp/127.0.0.1:7447",),
         connect=("tcp/127.0.0.1:7448",),
@@ -330,6 +338,15 @@ def test_bus_overrides(tmp_path: Path) -> None:
     assert changed.simulation == system.simulation
 
 
+def test_results_overrides(tmp_path: Path) -> None:
+    """What was not given leaves the file's settings."""
+    text = f"{SYSTEM}\n[results]\nvariables = ['wheel.*']\nevery = 5\n"
+    system = load_system(written(tmp_path, text))
+    changed = system.with_results(variables=(), every=None, formats=("mat",))
+    assert changed.results == ResultsSettings(variables=("wheel.*",), every=5, formats=("mat",))
+    assert (changed.simulation, changed.bus) == (system.simulation, system.bus)
+
+
 def test_a_missing_stop_time_may_come_later_but_must_come(tmp_path: Path) -> None:
     """The file may leave it to the command line; without it nothing is started."""
     system = load_system(written(tmp_path, SYSTEM.replace("stop_time = 4.0", "")))
@@ -350,7 +367,7 @@ def test_a_missing_stop_time_may_come_later_but_must_come(tmp_path: Path) -> Non
         (simulation("tolerance = 1"), "[simulation] unknown key 'tolerance'; did you mean "),
         (
             SYSTEM.replace("[simulation]", "[simulaton]"),
-            "unknown key 'simulaton'; did you mean 'simulation'?",
+            "unknown key 'simulaton'; did you mean 'simulation'",
         ),
         (f"{SYSTEM}\n[base]\n", "base: unknown table or key"),
         (f"source = 'x'\n{SYSTEM}", "source: unknown table or key"),
@@ -364,6 +381,7 @@ def test_a_missing_stop_time_may_come_later_but_must_come(tmp_path: Path) -> Non
             "[[connections]] number 2: unknown key 'factr'; did you mean 'factor'?",
         ),
         (bus("conect = []"), "[bus] unknown key 'conect'; did you mean 'connect'?"),
+        (f"{SYSTEM}\n[results]\nvariable = []", "[results] unknown key 'variable'; did you mean"),
     ],
 )
 def test_unknown_keys_are_mistakes_everywhere(tmp_path: Path, text: str, words: str) -> None:
@@ -497,6 +515,13 @@ def test_values_that_contradict_each_other(tmp_path: Path, lines: str, words: st
         ('[slaves.a]\n[bus]\nlisten = "x"', "[bus] listen = 'x': must be an array"),
         ("[slaves.a]\n[bus]\ninsecure = 1", "[bus] insecure = 1: "),
         ("[slaves.a]\n[bus]\nstep_timeout = 0", "[bus] step_timeout = 0: "),
+        ("[slaves.a]\n[results]\nevery = 0", "[results] every = 0: "),
+        ("[slaves.a]\n[results]\nevery = 1.5", "[results] every = 1.5: "),
+        ("[slaves.a]\n[results]\nformats = []", "[results] formats = []: must not be empty"),
+        ("[slaves.a]\n[results]\nformats = ['xls']", "'csv', 'arrow', 'parquet' or 'mat'"),
+        ("[slaves.a]\n[results]\nvariables = 'a.*'", "variables = 'a.*': must be an array"),
+        ("[slaves.a]\n[results]\nvariables = []", "[results] variables = []: must not be empty"),
+        ("[slaves.a]\n[results]\nvariables = ['!']", "'!': write a pattern for slave.variable"),
         ("[slaves.a]\n[bus]\ndiscovery_timeout = -1", "[bus] discovery_timeout = -1: "),
         ("[slaves.a]\n[slaves.a]", "not a TOML file: "),
         ("[slaves.a", "not a TOML file: "),

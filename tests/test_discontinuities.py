@@ -86,11 +86,21 @@ def test_a_jump_is_localised_to_the_smallest_step(
 def test_a_jump_is_found_wherever_it_is(
     oscillator_dir: Path, oscillators: ModuleType, t_step: float
 ) -> None:
-    """Law: at any time, inside the first or the second small step, one jump is found."""
+    """Law: one jump is found wherever it is, unless ERR alone has made it as small as any error.
+
+    Rejections come first; they may end with an H whose ERR is within the tolerance, jump and all.
+    """
     result = kick(oscillator_dir, t_step)
-    (crossing,) = crossings(result)
-    assert crossing["time"] < t_step <= crossing["time"] + 2.0 * SMALLEST * (1 + 1e-6)
-    assert result.summary["discontinuities"] == 1
+    found = crossings(result)
+    if len(found) == 0:
+        steps = result.steps[result.steps["accepted"]]
+        over = steps[steps["time"] < t_step][-1]
+        assert 0.1 < over["error_norm"] <= 1.0
+        assert over["step_size"] < 1e-3
+    else:
+        (crossing,) = found
+        assert crossing["time"] < t_step <= crossing["time"] + 2.0 * SMALLEST * (1 + 1e-6)
+    assert result.summary["discontinuities"] == len(found)
     assert largest_error(oscillators, result, t_step) < 6e-3
 
 

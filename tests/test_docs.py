@@ -34,6 +34,7 @@ from master_node.configuration import (
     Connection,
     InputSettings,
     OutputTolerance,
+    ResultsSettings,
     SimulationSettings,
     SlaveSettings,
     System,
@@ -303,6 +304,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "## `[slaves.NAME.tolerances.OUTPUT]`": OutputTolerance,
     "## `[[connections]]`": Connection,
     "## `[inputs]`": InputSettings,
+    "## `[results]`": ResultsSettings,
     "## `[bus]`": BusSettings,
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,30 @@ def test_chosen_variables_only() -> None:
     assert labels(result.plot(variables=["chassis.v"])) == ["[m/s]", "H [s]", "ERR"]
     with pytest.raises(KeyError, match=r"chassis\.q.*did you mean"):
         result.plot(variables=["chassis.q"])
+
+
+def test_discrete_variables_are_drawn_as_steps() -> None:
+    """Numbers and booleans keep their value up to the next point; texts are left out or refused."""
+    bare = make_result()
+    n = len(bare.time)
+    result = replace(
+        bare,
+        units={**bare.units, "box.gear": "", "box.on": "", "box.label": ""},
+        discrete={
+            "box.gear": np.arange(n),
+            "box.on": np.arange(n) % 2 == 0,
+            "box.label": np.array(["a"] * n, object),
+        },
+    )
+    figure = result.plot()
+    assert labels(figure) == ["[m]", "[m/s]", "box", "H [s]", "ERR"]
+    assert legend(figure, 2) == ["box.gear", "box.on"]
+    gear, on = figure.axes[2].get_lines()
+    assert gear.get_drawstyle() == on.get_drawstyle() == "steps-post"
+    assert np.array_equal(gear.get_ydata(), np.arange(n))
+    assert figure.axes[0].get_lines()[0].get_drawstyle() == "default"
+    with pytest.raises(KeyError, match=r"box\.label holds no numbers"):
+        result.plot(variables=["box.label"])
 
 
 def test_many_variables_are_cut_and_it_is_said() -> None:

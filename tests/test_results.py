@@ -17,17 +17,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master_node import results as results_module
 from master_node.observers import (
     Attempt,
     Observer,
     Outcome,
+    Point,
     RunEnd,
     RunStart,
     SlaveStatistics,
     Statistics,
 )
-from master_node.results import Recording, Result, ResultsWriter
+from master_node.results import STEPS_DTYPE, Recording, Result, ResultsWriter
+from master_node.results import writer as writer_module
 from protocol.errors import ResultsError
 
 NAMES = ("wheel.x", "wheel.v", "chassis.x", "chassis.v")
@@ -50,7 +51,7 @@ def start() -> RunStart:
 
 def accepted(time: float, step_size: float, limiting: str = "wheel.v") -> Attempt:
     """A double step to two new points."""
-    points = tuple((t, outputs(t)) for t in (time + step_size, time + 2 * step_size))
+    points = tuple(Point(t, outputs(t)) for t in (time + step_size, time + 2 * step_size))
     return Attempt(time, step_size, 3, 1, 0.25, True, limiting, points)
 
 
@@ -162,7 +163,7 @@ def test_equal_numbers_give_equal_bytes(tmp_path: Path) -> None:
             np.float64(a.error_norm),
             a.accepted,
             a.limiting_variable,
-            tuple((np.float64(time), y.copy()) for time, y in a.points),
+            tuple(Point(np.float64(p.time), p.outputs.copy()) for p in a.points),
         )
         for a in ATTEMPTS
     )
@@ -179,7 +180,7 @@ def test_numbers_come_back_bit_for_bit(
 
     A NaN comes back as a NaN; its payload has no text.
     """
-    points = tuple((float(i), np.array(row)) for i, row in enumerate(rows, 1))
+    points = tuple(Point(float(i), np.array(row)) for i, row in enumerate(rows, 1))
     attempt = Attempt(rows[0][0], rows[0][1], 1, 0, rows[0][2], True, "", points)
     result = Result.load(write(tmp_path_factory.mktemp("bits"), [attempt]))
     expected = np.array(rows)
@@ -211,7 +212,7 @@ def test_a_system_without_outputs_has_a_time_column_only(tmp_path: Path) -> None
     """No outputs, m = 0, is a valid number of outputs."""
     writer = ResultsWriter(tmp_path, {})
     writer.started(RunStart((), (), 0.0, 1.0, np.zeros(0)))
-    writer.attempted(Attempt(0.0, 0.5, 0, 0, math.nan, True, "", ((0.5, np.zeros(0)),)))
+    writer.attempted(Attempt(0.0, 0.5, 0, 0, math.nan, True, "", (Point(0.5, np.zeros(0)),)))
     writer.ended(end())
     assert (tmp_path / "results.csv").read_text() == "time\n0.0\n0.5\n"
     result = Result.load(tmp_path)
@@ -281,7 +282,7 @@ def test_memory_does_not_grow_with_the_run(tmp_path: Path, monkeypatch: pytest.M
         now += 1e-3
         return now
 
-    monkeypatch.setattr(results_module, "monotonic", clock)
+    monkeypatch.setattr(writer_module, "monotonic", clock)
     writer = ResultsWriter(tmp_path, SETTINGS)
     writer.started(start())
     attempt, reason = accepted(0.5, 0.1), "no error norm at t = {}"
@@ -305,7 +306,7 @@ def test_lines_reach_the_disk_twice_a_second(
 ) -> None:
     """Within 0.5 s nothing is written; the first attempt after that takes all lines with it."""
     now = 100.0
-    monkeypatch.setattr(results_module, "monotonic", lambda: now)
+    monkeypatch.setattr(writer_module, "monotonic", lambda: now)
     writer = ResultsWriter(tmp_path, {})
     writer.started(start())
     assert (tmp_path / "results.csv").read_text().count("\n") == 2, "T_0 is there at once"
@@ -325,7 +326,7 @@ def test_killed_writer_leaves_whole_lines(tmp_path: Path) -> None:
     process = run_python(
         """
         writer = helpers.ResultsWriter(Path(sys.argv[2]), {})
-        helpers.results_module.FLUSH_INTERVAL = 0.02
+        helpers.writer_module.FLUSH_INTERVAL = 0.02
         writer.started(helpers.start())
         for i in range(10**9):
             writer.attempted(helpers.accepted(i * 0.5, 0.25))
@@ -354,7 +355,7 @@ def test_full_disk_leaves_readable_results(tmp_path: Path) -> None:
         """
         import resource
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-        helpers.results_module.FLUSH_INTERVAL = 0.0
+        helpers.writer_module.FLUSH_INTERVAL = 0.0
         writer = helpers.ResultsWriter(Path(sys.argv[2]), {})
         writer.started(helpers.start())
         try:
@@ -379,10 +380,10 @@ def test_interrupted_write_is_repeated_not_doubled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk that is full for a while costs no line and doubles none, once there is room."""
-    monkeypatch.setattr(results_module, "FLUSH_INTERVAL", 0.0)
+    monkeypatch.setattr(writer_module, "FLUSH_INTERVAL", 0.0)
     writer = ResultsWriter(tmp_path, {})
     writer.started(start())
-    file = writer._files[0]._file
+    file = writer._results[0]._file
 
     class Full:
         def __getattr__(self, name: str) -> object:
@@ -393,11 +394,11 @@ def test_interrupted_write_is_repeated_not_doubled(
                 raise OSError(errno.ENOSPC, "No space left on device")
             return file.write(data[:17])
 
-    monkeypatch.setattr(writer._files[0], "_file", Full())
+    monkeypatch.setattr(writer._results[0], "_file", Full())
     with pytest.raises(ResultsError, match=r"results\.csv: No space left on device; free space"):
         writer.attempted(accepted(0.0, 0.25))
     assert Result.load(tmp_path).time.tolist() == [0.0]
-    monkeypatch.setattr(writer._files[0], "_file", file)
+    monkeypatch.setattr(writer._results[0], "_file", file)
     writer.ended(end())
     assert Result.load(tmp_path).time.tolist() == [0.0, 0.25, 0.5]
 
@@ -465,9 +466,12 @@ def test_old_results_are_replaced_and_other_files_stay(tmp_path: Path) -> None:
     writer.prepare()
     assert Result.load(directory).summary, "until the run starts, the old results stay"
     writer.started(start())
-    assert sorted(p.name for p in directory.iterdir()) == ["notes.txt", "results.csv", "steps.csv"]
+    now = {path.name for path in directory.iterdir()}
+    assert now == {".start.json", "notes.txt", "results.csv", "steps.csv"}
     assert Result.load(directory).time.tolist() == [0.0]
     writer.ended(end())
+    now = {path.name for path in directory.iterdir()}
+    assert now == {"notes.txt", "results.csv", "steps.csv", "summary.json"}
 
 
 def test_end_without_a_start_writes_nothing(tmp_path: Path) -> None:
@@ -564,7 +568,7 @@ def put(directory: Path, lines: Sequence[str], name: str = "results.csv") -> Pat
 def test_unfinished_last_line_is_left_out(tmp_path: Path) -> None:
     """Without its line break a last number may be cut: 0.12 of 0.125 is no result."""
     put(tmp_path, ["time,a.x", "0.0,1.0", "0.5,0.12"])
-    put(tmp_path, [",".join(results_module.STEPS_DTYPE.names), "0.0,0.5,1,0,0.1,tr"], "steps.csv")
+    put(tmp_path, [",".join(STEPS_DTYPE.names), "0.0,0.5,1,0,0.1,tr"], "steps.csv")
     result = Result.load(tmp_path)
     assert result.time.tolist() == [0.0]
     assert len(result.steps) == 0
@@ -614,7 +618,7 @@ def test_malformed_companions_name_file_and_line(
 ) -> None:
     """The other two files are held to the same."""
     put(tmp_path, ["time,a.x", "0.0,1.0", ""])
-    header = ",".join(results_module.STEPS_DTYPE.names)
+    header = ",".join(STEPS_DTYPE.names)
     put(tmp_path, [header if line is None else line for line in lines], name)
     with pytest.raises(ResultsError, match=message):
         Result.load(tmp_path)
@@ -634,9 +638,7 @@ def test_any_bytes_load_or_are_refused(
     """Whatever is in the file, the only error is a ``ResultsError``."""
     directory = tmp_path_factory.mktemp("any")
     (directory / "results.csv").write_bytes(b"time,a.x\n" + content)
-    (directory / "steps.csv").write_bytes(
-        ",".join(results_module.STEPS_DTYPE.names).encode() + b"\n" + content
-    )
+    (directory / "steps.csv").write_bytes(",".join(STEPS_DTYPE.names).encode() + b"\n" + content)
     (directory / "summary.json").write_bytes(b"{" + content)
     for name in ("summary.json", "steps.csv", "results.csv"):
         try:

@@ -60,11 +60,14 @@ class InputKind(NamedTuple):
         has_derivative: whether the output behind it comes with its derivative.
         ahead: whether its value at the end of a step is known before its slave takes the step,
             because the slave behind it goes first (Gauss-Seidel).
+        late: whether its value is not known before its slave has taken a whole double step,
+            because the slave behind it cannot go back and goes last.
     """
 
     max_order: int = MAX_ORDER
     has_derivative: bool = False
     ahead: bool = False
+    late: bool = False
 
 
 class CouplingHistory(NamedTuple):
@@ -110,6 +113,10 @@ class CouplingHistory(NamedTuple):
         """The newest point alone: what was before a discontinuity says nothing any more."""
         return CouplingHistory(self.times[:1], self.inputs[:1], self.depth)
 
+    def before(self, number: int) -> CouplingHistory:
+        """Without the ``number`` newest points, of which there must be fewer than of all."""
+        return CouplingHistory(self.times[number:], self.inputs[number:], self.depth)
+
     def every_second(self) -> CouplingHistory:
         """T_n, T_(n-2), T_(n-4), ...: the grid of one step of 2H."""
         return CouplingHistory(self.times[::2], self.inputs[::2], self.depth)
@@ -134,6 +141,7 @@ class Extrapolation:
 
     def __init__(self, kinds: Sequence[InputKind], kind_of_input: NDArray[np.intp]) -> None:
         self.kinds = tuple(kinds)
+        self.kind_of_input = kind_of_input
         self._columns = [np.flatnonzero(kind_of_input == i) for i in range(len(self.kinds))]
 
     def polynomials(self, polynomial: InputPolynomial, points: int) -> Polynomials:

@@ -35,6 +35,24 @@ def trial_step_size(
     return min(0.01 * d0 / d1, 1e-3 * duration)
 
 
+def untried_step_size(
+    y: FloatArray, slope: FloatArray | None, scale: FloatArray, duration: float
+) -> float:
+    """H for a first step that cannot be taken back [s]: y changes by half of its tolerance.
+
+    In two such steps it changes by the tolerance, so that even inputs held constant are within.
+
+    Args:
+        y: outputs at T_0, shape (m,).
+        slope: their derivatives, shape (m,); None: one of them is not known.
+        scale: ATOL + RTOL |y|, shape (m,).
+        duration: simulated time [s].
+    """
+    trial = trial_step_size(y, slope, scale, duration)
+    d1 = 0.0 if slope is None else _norm(slope, scale)
+    return min(trial, 0.5 / d1) if d1 > 0.0 else trial
+
+
 def initial_step_size(
     y: FloatArray,
     y_middle: FloatArray,

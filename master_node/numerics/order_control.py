@@ -14,9 +14,10 @@ derivatives pass through zero.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from math import inf, sqrt
 from math import pow as power
-from math import sqrt
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +46,9 @@ SMALLEST_FACTOR = 0.1
 
 DEPTH = MAX_ORDER + 2
 """Communication points that the divided differences need."""
+
+NO_BOUNDS: Mapping[InputPolynomial, float] = MappingProxyType({})
+"""Nothing but the errors of the polynomials bounds H."""
 
 
 class OrderMemory(NamedTuple):
@@ -120,6 +124,11 @@ def ladder(*, has_derivatives: bool, derivative_points: int) -> tuple[InputPolyn
     return tuple(steps)
 
 
+def beginning(polynomials: Sequence[InputPolynomial]) -> InputPolynomial:
+    """The one of a `ladder` for where only one communication point says anything."""
+    return polynomials[1] if polynomials[1].derivative_points else polynomials[0]
+
+
 def input_magnitudes(
     history: CouplingHistory,
     has_derivative: NDArray[np.bool_],
@@ -192,6 +201,7 @@ def choose(
     error: FloatArray,
     step_size: float,
     alpha: float,
+    bounds: Mapping[InputPolynomial, float] = NO_BOUNDS,
 ) -> Choice:
     """The polynomial for the next double step, after one was accepted.
 
@@ -203,9 +213,9 @@ def choose(
         error: what each group of outputs contributed to ERR in it, shape (groups,).
         step_size: H of that step [s].
         alpha: safety factor of the step size controller.
+        bounds: of H over the present H with some polynomials, for other reasons.
     """
     stay = memory._replace(steps=memory.steps + 1, magnitudes=magnitudes)
-    keep = Choice(stay._replace(better=None, times_better=0), None)
     if not taken.is_known(magnitudes):
         return Choice(stay, None)
     caused = taken.errors(magnitudes)
@@ -217,23 +227,37 @@ def choose(
         np.maximum(smoothed[:levels], previous[:levels], out=smoothed[:levels])
     now = memory.polynomial
     factors = {
-        candidate.polynomial: _factor(candidate, smoothed, reaction, alpha)
+        candidate.polynomial: min(
+            _factor(candidate, smoothed, reaction, alpha), bounds.get(candidate.polynomial, inf)
+        )
         for candidate in candidates
         if abs(candidate.polynomial.order - now.order) <= 1
         and candidate.is_known(smoothed)
         and (candidate.polynomial.derivative_points < 2 or _is_smooth(smoothed, step_size))
     }
+    return prefer(stay, factors)
+
+
+def prefer(memory: OrderMemory, factors: Mapping[InputPolynomial, float]) -> Choice:
+    """The polynomial that allows the largest H, by the rules that keep the choice calm.
+
+    Args:
+        memory: with the step just taken counted.
+        factors: H that the polynomials allow, over the present H.
+    """
+    keep = Choice(memory._replace(better=None, times_better=0), None)
     if not factors:
         return keep
+    now = memory.polynomial
     best = max(factors, key=factors.__getitem__)
     if best == now or factors[best] <= GAIN * factors.get(now, 0.0):
         return keep
     times = memory.times_better + 1 if memory.better == best else 1
     is_rise = best.order > now.order and best.derivative_points < 2
     needed = 1 if is_rise else TIMES_BETTER
-    if times < needed or stay.steps < REST:
-        return Choice(stay._replace(better=best, times_better=times), None)
-    return Choice(OrderMemory(best, magnitudes=magnitudes), factors[best])
+    if times < needed or memory.steps < REST:
+        return Choice(memory._replace(better=best, times_better=times), None)
+    return Choice(OrderMemory(best, magnitudes=memory.magnitudes), factors[best])
 
 
 def _factor(

@@ -52,3 +52,6 @@ REDUCTIONS: Mapping[str, Reduction] = {
     "rms": rms,
 }
 """By the names that a study gives them. A value that is not finite gives one that is not."""
+
+REDUCTIONS_OF_VALUES = frozenset({"first", "last", "min", "max", "max_abs"})
+"""Those that need the values at the points only, and not what is between them."""

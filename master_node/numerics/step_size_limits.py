@@ -139,6 +139,31 @@ class StepSizeLimits:
         end = float(zero + (done + 2 * units) * quantum)
         return DoubleStepTimes(begin, middle, end, size, size)
 
+    def step(
+        self, origin: float, begin: float, step_size: float, target: float
+    ) -> tuple[float, float]:
+        """The end and the size of the next single step, so that the last one ends on ``target``.
+
+        When less than two steps are left they share what is left. Arguments as for `times`.
+        """
+        if self.quantum is None:
+            left = target - begin
+            size = left if step_size >= left else min(step_size, left / 2.0)
+            size = _planned(size, left, self.smallest, self.largest)
+            return (target, left) if size >= left else (begin + size, size)
+        quantum, zero = self.quantum, _decimal(origin)
+        done = round((Fraction(begin) - zero) / quantum)
+        units_left = round((Fraction(target) - zero) / quantum) - done
+        fewest = max(1, ceil(_decimal(self.smallest) / quantum))
+        units = max(fewest, int(_decimal(step_size) // quantum))
+        if units >= units_left:
+            units = units_left
+        elif 2 * units > units_left:
+            units = (units_left + 1) // 2
+        most = int(_decimal(self.largest) // quantum)
+        units = max(1, _planned(units, units_left, fewest, most))
+        return float(zero + (done + units) * quantum), float(units * quantum)
+
     def crossing(self, origin: float, event: float) -> DoubleStepTimes:
         """The double step of the smallest size that leads over an event at ``event`` [s].
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +13,9 @@ from typing import Any
 from master_node.co_simulation import check_capabilities
 from master_node.configuration import InputSettings, System
 from master_node.input_loading import load_signals
+from master_node.numerics.reductions import REDUCTIONS_OF_VALUES
+from master_node.results.selection import check_variables, chosen
+from master_node.results.summary import settings_sha256
 from master_node.simulation import settings_of
 from master_node.start_values import start_values
 from master_node.step_size_rules import check_step_sizes
@@ -24,7 +26,7 @@ from master_node.system import CoupledSystem, resolve
 from master_node.system_files import open_system
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.names import nearest
-from protocol.slave import SlaveDescription
+from protocol.slave import SlaveDescription, VariableType
 
 log = logging.getLogger("master_node")
 
@@ -136,7 +138,7 @@ class _Check:
             self._check_outputs(coupled)
         settings = settings_of(system, self._descriptions)
         kept = {key: value for key, value in settings.items() if key not in _NO_INFLUENCE}
-        return _sha256_of({"settings": kept, **self._surroundings})
+        return settings_sha256({"settings": kept, **self._surroundings})
 
     def _resolve(self, system: System) -> CoupledSystem:
         span = (float(system.simulation.start_time), system.checked().simulation.end)
@@ -153,12 +155,26 @@ class _Check:
         return coupled
 
     def _check_outputs(self, coupled: CoupledSystem) -> None:
+        discrete = dict(zip(coupled.discrete.names, coupled.discrete.types, strict=True))
+        names = (*coupled.output_names, *discrete)
+        patterns = self._system.results.variables
+        check_variables(patterns, names, self._system.source)
+        known = [
+            name for name, is_kept in zip(names, chosen(patterns, names), strict=True) if is_kept
+        ]
         for name, output in self._study.results.outputs.items():
-            if output.variable not in coupled.output_names:
+            where = f"{self._study.source}: [results.outputs.{name}]"
+            variable = output.variable
+            if variable not in known:
                 raise ConfigurationError(
-                    f"{self._study.source}: [results.outputs.{name}] variable = "
-                    f"{output.variable!r}: no such output"
-                    f"{nearest(output.variable, coupled.output_names)}"
+                    f"{where} variable = {variable!r}: no such output{nearest(variable, known)}"
+                )
+            if discrete.get(variable) in (VariableType.STRING, VariableType.BINARY):
+                raise ConfigurationError(f"{where} {variable} is no number")
+            if variable in discrete and output.reduce not in REDUCTIONS_OF_VALUES:
+                raise ConfigurationError(
+                    f"{where} reduce = {output.reduce!r}: {variable} is held between the points",
+                    remedy=f"take one of {', '.join(sorted(REDUCTIONS_OF_VALUES))}",
                 )
 
 
@@ -173,8 +189,3 @@ def _hashes_of_input_files(system: System) -> dict[str, str]:
             if path.is_file():  # a function may be in a package instead
                 hashes[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     return hashes
-
-
-def _sha256_of(value: object) -> str:
-    text = json.dumps(value, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()

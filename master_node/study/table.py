@@ -107,7 +107,7 @@ def _counters(summary: Mapping[str, Any], directory: Path) -> dict[str, Cell]:
 
 def _reduced(result: Result, output: ReducedOutput, directory: Path) -> float:
     try:
-        values = result[output.variable]
+        values = result[output.variable].astype(float)
     except KeyError as error:
         raise ResultsError(f"{directory}: {error.args[0]}") from None
     if not len(values):

@@ -1,0 +1,78 @@
+/* A staircase and a lag that follows it: the level (Int32, discrete) rises by 1 at every multiple
+ * of 0.35 s, and x' = (level - x) / T with the exact solution. With event mode a step ends at the
+ * next of these times; without, it passes over them and the level rises on the way. */
+#include "lag.h"
+
+#include <math.h>
+
+enum { LEVEL = LAG_REFERENCES };
+
+static const double INTERVAL = 0.35; /* s */
+
+typedef struct {
+    Lag lag;
+    int32_t level;
+    int32_t event_is_due; /* the last step ended at an event */
+} State;
+
+static Variable find(void *block, Type type, uint32_t reference)
+{
+    State *state = block;
+    if (type == INT32 && reference == LEVEL)
+        return (Variable){&state->level, 1, READ_ONLY};
+    return reference == LAG_U ? (Variable){0} : lag_find(block, type, reference);
+}
+
+static double next_event(const State *state)
+{
+    return INTERVAL * (state->level + 1);
+}
+
+static void rise(State *state)
+{
+    state->level += 1;
+    state->lag.u = state->level;
+    state->event_is_due = 0;
+}
+
+static Outcome step_up(void *block, void *hidden, Step *step)
+{
+    State *state = block;
+    (void)hidden;
+    if (state->event_is_due) {
+        step->reason = "the event at this time is to be handled in event mode first";
+        return STEP_REFUSED;
+    }
+    double now = step->t;
+    while (next_event(state) <= step->reached) {
+        const double event = fmax(now, next_event(state));
+        lag_advance(&state->lag, event - now);
+        now = event;
+        if (step->stop_at_events) {
+            state->event_is_due = 1;
+            step->event = true;
+            step->reached = event;
+            return STEP_TAKEN;
+        }
+        rise(state);
+    }
+    lag_advance(&state->lag, step->reached - now);
+    return STEP_TAKEN;
+}
+
+static bool update(void *block, double time, double *next)
+{
+    State *state = block;
+    if (next_event(state) <= time)
+        rise(state);
+    *next = next_event(state);
+    return false; /* x does not jump */
+}
+
+const Behaviour behaviour = {.state_size = sizeof(State),
+                             .start = lag_start,
+                             .find = find,
+                             .initialized = lag_initialized,
+                             .calculate = lag_calculate,
+                             .step = step_up,
+                             .update = update};

@@ -1,0 +1,178 @@
+"""The files of a results directory: their names, how they grow, and what is said of failures."""
+
+from __future__ import annotations
+
+import errno
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+from master_node.observers import Point
+from protocol.errors import ResultsError
+
+RESULTS_FILE = "results.csv"
+ARROW_FILE = "results.arrow"
+PARQUET_FILE = "results.parquet"
+MAT_FILE = "results.mat"
+STEPS_FILE = "steps.csv"
+SUMMARY_FILE = "summary.json"
+PLOT_FILE = "results.png"
+
+START_FILE = ".start.json"
+"""The columns with their units and types, while there is no summary."""
+
+STREAM_FILE = ".results.arrow"
+"""Stands in for results.arrow while a run without it goes on that ends with Parquet or MAT."""
+
+_UNFINISHED = "{}.part"
+
+FILES = (
+    SUMMARY_FILE,
+    RESULTS_FILE,
+    ARROW_FILE,
+    PARQUET_FILE,
+    MAT_FILE,
+    STEPS_FILE,
+    PLOT_FILE,
+    START_FILE,
+    STREAM_FILE,
+    *map(_UNFINISHED.format, (PARQUET_FILE, MAT_FILE, SUMMARY_FILE, START_FILE)),
+)
+"""All that a run may leave and the next one in the same directory replaces."""
+
+_REMEDIES = {
+    errno.ENOSPC: "free space on that disk or choose a results directory on another one",
+    errno.EDQUOT: "free space within your quota or choose a results directory elsewhere",
+    errno.EEXIST: "a file is in the way; choose another name for the results directory",
+    errno.ENOTDIR: "part of the path is a file; choose another results directory",
+}
+
+
+class ResultsFile(Protocol):
+    """A file that gets the points of a run while it goes on."""
+
+    path: Path
+
+    def append(self, point: Point) -> None:
+        """Hold one point back for the next ``flush``."""
+        ...
+
+    def flush(self) -> None:
+        """Write what is held back, or leave the file as it was; OSError."""
+        ...
+
+    def close(self) -> None:
+        """Make sure that it is on the disk; OSError."""
+        ...
+
+
+class BatchFile(ABC):
+    """A new file that only ever grows by whole batches."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("xb", buffering=0)
+        self._size = 0
+
+    @abstractmethod
+    def _batch(self) -> bytes:
+        """What is to be written next."""
+
+    @abstractmethod
+    def _written(self) -> None:
+        """That batch is in the file: forget it."""
+
+    def flush(self) -> None:
+        """Write the batch, or leave the file as it was; both can be repeated after an error."""
+        self._write(self._batch())
+        self._written()
+
+    def close(self) -> None:
+        """To the disk, and no more."""
+        with self._file:
+            os.fsync(self._file.fileno())
+
+    def _write(self, batch: bytes) -> None:
+        rest = memoryview(batch)
+        try:
+            self._file.seek(self._size)
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError:
+            with suppress(OSError):
+                self._file.truncate(self._size)
+            raise
+        self._size += len(batch)
+
+
+class LineFile(BatchFile):
+    """Batches of lines.
+
+    Args:
+        path: of the new file.
+        head: the first line.
+    """
+
+    def __init__(self, path: Path, head: str) -> None:
+        super().__init__(path)
+        self._lines = [head]
+        self._add = self._lines.append
+
+    def _batch(self) -> bytes:
+        return "".join(self._lines).encode(errors="replace")
+
+    def _written(self) -> None:
+        self._lines.clear()
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file beside ``path`` that takes its place when all went well, and else is removed.
+
+    Raises:
+        OSError: it cannot be written; ``path`` is as it was.
+    """
+    unfinished = path.with_name(_UNFINISHED.format(path.name))
+    try:
+        with unfinished.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+        raise
+
+
+def one_field(text: str) -> str:
+    """One CSV field on one line."""
+    text = text.replace("\r", " ").replace("\n", " ")
+    return '"' + text.replace('"', '""') + '"' if "," in text or '"' in text else text
+
+
+def cannot_write(path: Path, error: OSError) -> ResultsError:
+    """For whoever has to write there."""
+    return ResultsError(
+        f"cannot write {path}: {error.strerror or error}",
+        remedy=_REMEDIES.get(error.errno or 0, "choose a results directory that you may write to"),
+    )
+
+
+def cannot_read(path: Path, error: OSError) -> ResultsError:
+    """For whoever has to read there; without a number it is a library's word for broken bytes."""
+    if error.errno is None:
+        return malformed(path, str(error))
+    return ResultsError(
+        f"cannot read {path}: {error.strerror or error}",
+        remedy="name a results directory, or a file .csv, .arrow, .parquet or .mat",
+    )
+
+
+def malformed(path: Path, what: str, line: int | None = None) -> ResultsError:
+    """A file that is there and makes no sense."""
+    place = f"{path}, line {line}" if line else str(path)
+    return ResultsError(f"{place}: {what}")

@@ -1,0 +1,195 @@
+"""What a run gave, from memory or read back from its files."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from master_node.results.columns import NOTHING_KNOWN, DiscreteArray, Known, Table
+from master_node.results.csv_file import read_csv
+from master_node.results.files import (
+    ARROW_FILE,
+    MAT_FILE,
+    PARQUET_FILE,
+    RESULTS_FILE,
+    START_FILE,
+    STEPS_FILE,
+    STREAM_FILE,
+    SUMMARY_FILE,
+)
+from master_node.results.steps_file import Steps, read_steps
+from master_node.results.summary import read_json
+from protocol.signals import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result:
+    """What a run gave. ``result["wheel.x"]`` is a variable over ``result.time``.
+
+    Attributes:
+        names: ``slave.variable`` of the m outputs.
+        units: of each name and of the discrete variables, "" where none is known.
+        time: the n communication points [s], shape (n,).
+        outputs: row i is y at ``time[i]``, shape (n, m); column j belongs to ``names[j]``.
+        steps: the attempts, accepted or not; structured array of ``STEPS_DTYPE``.
+        summary: as in ``summary.json``; empty when the run did not get to its end.
+        discrete: the discrete variables by name, shape (n,) each: float64, int64, bool, or objects
+            that are str or bytes.
+    """
+
+    names: tuple[str, ...]
+    units: Mapping[str, str]
+    time: FloatArray
+    outputs: FloatArray
+    steps: NDArray[np.void]
+    summary: Mapping[str, Any]
+    discrete: Mapping[str, DiscreteArray] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, table: Table, steps: Steps, summary: Mapping[str, Any]) -> Result:
+        """From its parts."""
+        columns = table.columns
+        return cls(
+            names=columns.names,
+            units=columns.all_units,
+            time=table.time,
+            outputs=table.outputs,
+            steps=steps.to_array(),
+            summary=summary,
+            discrete=dict(zip(columns.discrete_names, table.discrete, strict=True)),
+        )
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name == "time":
+            return self.time
+        if name in self.discrete:
+            return self.discrete[name]
+        try:
+            return self.outputs[:, self._columns[name]]
+        except KeyError:
+            names = tuple(self)
+            near = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
+            near = near or [full for full in names if full.endswith("." + name)][:3]
+            hint = f"did you mean {' or '.join(near)}?" if near else "see result.names"
+            raise KeyError(f"no variable {name}; {hint}") from None
+
+    def __contains__(self, name: object) -> bool:
+        return name == "time" or name in self._columns or name in self.discrete
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((*self.names, *self.discrete))
+
+    def __repr__(self) -> str:
+        rejected = int(np.count_nonzero(~self.steps["accepted"]))
+        shown = [f"{name} [{unit}]" if unit else name for name, unit in self.units.items()]
+        more = f", ... ({len(shown)} in all)" if len(shown) > 8 else ""
+        span = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""
+        return (
+            f"<Result {self.summary.get('outcome', 'without an end')}: "
+            f"{len(self.time)} communication points{span}, "
+            f"{len(self.steps)} attempts, {rejected} rejected\n"
+            f"  {', '.join(shown[:8])}{more}>"
+        )
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return ["time", *self]
+
+    @cached_property
+    def _columns(self) -> dict[str, int]:
+        return {name: column for column, name in enumerate(self.names)}
+
+    def to_array(self) -> NDArray[np.void]:
+        """All rows as a structured array, shape (n,): ``time`` first, then the names."""
+        rows = np.empty(len(self.time), [(name, self[name].dtype) for name in ("time", *self)])
+        for name in ("time", *self):
+            rows[name] = self[name]
+        return rows
+
+    def plot(
+        self,
+        path: Path | str | None = None,
+        show: bool = False,
+        variables: Sequence[str] | None = None,
+    ) -> Figure:
+        """Draw outputs, step sizes and error norms over time.
+
+        Args:
+            path: file to write, its suffix is the format; None writes none.
+            show: open a window.
+            variables: names to draw; None draws them all.
+
+        Raises:
+            KeyError: no such variable, or one that holds no numbers.
+            ResultsError: the file cannot be written.
+        """
+        # matplotlib takes half a second to import, which a run without a plot need not pay
+        from master_node.plots import plot_result  # noqa: PLC0415
+
+        return plot_result(self, None if path is None else Path(path), show, variables)
+
+    @classmethod
+    def load(cls, source: Path | str) -> Result:
+        """Read a results directory, or one file with ``time`` in its first column.
+
+        A directory may come from a run that goes on or was killed: an unfinished last line or
+        batch is left out, ``steps`` and ``summary`` are empty where their files are missing. Of
+        several formats the first of CSV, Arrow, Parquet and MAT is read. A file is read by its
+        suffix, ``.arrow``, ``.parquet`` or ``.mat``, and else as CSV.
+
+        Raises:
+            ResultsError: there are no results, or a file is malformed; names file and line.
+        """
+        source = Path(source)
+        if not source.is_dir():
+            read = _FILE_READERS.get(source.suffix.lower(), _read_foreign_csv)
+            return cls.of(read(source, NOTHING_KNOWN), Steps(), {})
+        summary = read_json(source / SUMMARY_FILE)
+        known = Known.of(summary or read_json(source / START_FILE))
+        files = (source / name for name in _PREFERRED)
+        path = next((path for path in files if path.is_file()), source / RESULTS_FILE)
+        table = _READERS[path.suffix](path, known)
+        return cls.of(table, read_steps(source / STEPS_FILE), summary)
+
+
+_PREFERRED = (RESULTS_FILE, ARROW_FILE, PARQUET_FILE, STREAM_FILE, MAT_FILE)
+
+
+def _read_foreign_csv(path: Path, known: Known) -> Table:
+    return read_csv(path, known, complete_lines=False)
+
+
+def _read_arrow(path: Path, _: Known) -> Table:
+    from master_node.results.arrow_file import read_arrow  # noqa: PLC0415  pyarrow takes 0.1 s
+
+    return read_arrow(path)
+
+
+def _read_parquet(path: Path, _: Known) -> Table:
+    from master_node.results.parquet_file import read_parquet  # noqa: PLC0415  as above
+
+    return read_parquet(path)
+
+
+def _read_mat(path: Path, known: Known) -> Table:
+    from master_node.results.dymola_mat import read_mat  # noqa: PLC0415  scipy.io takes longer
+
+    return read_mat(path, known)
+
+
+_READERS: Mapping[str, Callable[[Path, Known], Table]] = {
+    ".csv": read_csv,
+    ".arrow": _read_arrow,
+    ".parquet": _read_parquet,
+    ".mat": _read_mat,
+}
+_FILE_READERS = {**_READERS, ".csv": _read_foreign_csv}

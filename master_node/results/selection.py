@@ -1,0 +1,133 @@
+"""Which variables and which points of a run become results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+
+import numpy as np
+from numpy.typing import NDArray
+
+from master_node.observers import Attempt, Observer, Point, RunEnd, RunStart
+from protocol.errors import ConfigurationError
+from protocol.names import nearest
+
+
+def check_variables(patterns: Sequence[str], names: Sequence[str], source: str) -> None:
+    """Refuse patterns that do not fit the variables of a system.
+
+    Args:
+        patterns: see ``chosen``.
+        names: ``slave.variable`` of all there are.
+        source: what to call the system.
+
+    Raises:
+        ConfigurationError: one matches no variable, with the nearest names, or none is left.
+    """
+    for pattern in patterns:
+        if not any(_matches(name, pattern.removeprefix("!")) for name in names):
+            raise ConfigurationError(
+                f"{source}: [results] variables: {pattern!r} matches no variable"
+                f"{nearest(pattern.removeprefix('!'), names)}"
+            )
+    if not any(chosen(patterns, names)):
+        raise ConfigurationError(f"{source}: [results] variables leaves no variable")
+
+
+def chosen(patterns: Sequence[str], names: Sequence[str]) -> NDArray[np.bool_]:
+    """Which names match a pattern, and none that begins with ``!``; shape (len(names),).
+
+    ``*`` stands for any text and ``?`` for one character, case counts, and brackets are what they
+    are, as FMI has them in names. Without a pattern to match, all names do.
+    """
+    wanted = [pattern for pattern in patterns if not pattern.startswith("!")] or ["*"]
+    unwanted = [pattern[1:] for pattern in patterns if pattern.startswith("!")]
+    return np.array(
+        [
+            any(_matches(name, pattern) for pattern in wanted)
+            and not any(_matches(name, pattern) for pattern in unwanted)
+            for name in names
+        ],
+        np.bool_,
+    )
+
+
+class SelectedResults:
+    """An observer that passes on the variables and the points that are wanted.
+
+    All attempts are passed on. The first and the last point of a run always are.
+
+    Args:
+        observer: gets what is left.
+        variables: patterns, see ``chosen``.
+        every: of the points after the first each ``every``-th is wanted.
+    """
+
+    def __init__(self, observer: Observer, variables: Sequence[str], every: int) -> None:
+        self._observer = observer
+        self._variables = tuple(variables)
+        self._every = every
+        self._outputs: NDArray[np.intp] | None = None
+        self._discrete: tuple[int, ...] | None = None
+        self._number = 0
+        self._passed_over: Point | None = None
+
+    def started(self, start: RunStart) -> None:
+        """Pass on what is chosen of it."""
+        outputs = np.flatnonzero(chosen(self._variables, start.output_names))
+        discrete = np.flatnonzero(chosen(self._variables, start.discrete_names))
+        some_outputs = len(outputs) < len(start.output_names)
+        some_discrete = len(discrete) < len(start.discrete_names)
+        self._outputs = outputs if some_outputs else None
+        self._discrete = tuple(discrete.tolist()) if some_discrete else None
+        self._number, self._passed_over = 0, None
+        self._observer.started(
+            replace(
+                start,
+                output_names=tuple(start.output_names[i] for i in outputs),
+                output_units=tuple(start.output_units[i] for i in outputs),
+                outputs=start.outputs[outputs],
+                discrete_names=tuple(start.discrete_names[i] for i in discrete),
+                discrete_types=tuple(start.discrete_types[i] for i in discrete),
+                discrete_units=tuple(start.discrete_units[i] for i in discrete)
+                if start.discrete_units
+                else (),
+                discrete=tuple(start.discrete[i] for i in discrete),
+            )
+        )
+
+    def attempted(self, attempt: Attempt) -> None:
+        """Pass on with the points that are wanted."""
+        points = attempt.points
+        if points and self._every > 1:
+            points = tuple(filter(self._is_wanted, points))
+        if points and not (self._outputs is None and self._discrete is None):
+            points = tuple(map(self._part, points))
+        self._observer.attempted(
+            attempt if points is attempt.points else attempt._replace(points=points)
+        )
+
+    def ended(self, end: RunEnd) -> None:
+        """Pass on, with the last point if it was not wanted before."""
+        last = self._passed_over
+        rest = (*end.points, *(() if last is None else (self._part(last),)))
+        self._observer.ended(replace(end, points=rest))
+
+    def _is_wanted(self, point: Point) -> bool:
+        self._number += 1
+        wanted = self._number % self._every == 0
+        self._passed_over = None if wanted else point
+        return wanted
+
+    def _part(self, point: Point) -> Point:
+        time, outputs, discrete = point
+        if self._outputs is not None:
+            outputs = outputs[self._outputs]
+        if self._discrete is not None:
+            discrete = tuple(discrete[i] for i in self._discrete)
+        return Point(time, outputs, discrete)
+
+
+def _matches(name: str, pattern: str) -> bool:
+    return fnmatchcase(name, pattern.replace("[", "[[]"))

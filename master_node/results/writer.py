@@ -1,0 +1,230 @@
+"""Results written while the run goes on, and turned into other formats when it has ended."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from time import monotonic
+
+from master_node.observers import Attempt, Point, Points, RunEnd, RunStart
+from master_node.results.columns import Columns
+from master_node.results.csv_file import CsvFile
+from master_node.results.files import (
+    ARROW_FILE,
+    FILES,
+    MAT_FILE,
+    PARQUET_FILE,
+    RESULTS_FILE,
+    START_FILE,
+    STEPS_FILE,
+    STREAM_FILE,
+    SUMMARY_FILE,
+    ResultsFile,
+    cannot_write,
+)
+from master_node.results.steps_file import StepsFile
+from master_node.results.summary import (
+    about_columns,
+    formats_of,
+    plain_mapping,
+    settings_sha256,
+    summarize,
+    write_json,
+)
+from protocol.errors import ResultsError
+
+FLUSH_INTERVAL = 0.5
+"""Shortest time between two writes [s]: what a killed master loses at most of a fast run."""
+
+
+class ResultsWriter:
+    """An observer that streams a run into a directory, with constant memory.
+
+    Rows are held back for ``FLUSH_INTERVAL`` and then written whole with one write per file, so
+    whoever kills the master leaves readable files. When a write fails, the file is cut back to
+    the last batch that is complete. Parquet and MAT are made from the stream at the end.
+
+    Args:
+        directory: see the package's docstring for the files in it.
+        settings: what the run was asked for; goes into the summary. ``settings["simulation"]``
+            names ``estimator`` and ``order``, ``settings["results"]`` the ``formats``, by default
+            ``csv``.
+    """
+
+    def __init__(self, directory: Path, settings: Mapping[str, object]) -> None:
+        self._directory = directory
+        self._settings = plain_mapping(settings)
+        self._formats = formats_of(self._settings)
+        self._start: RunStart | None = None
+        self._results: list[ResultsFile] = []
+        self._steps: StepsFile | None = None
+        self._next_flush = 0.0
+        self._broken = False
+
+    def prepare(self) -> None:
+        """Create the directory and try whether it can be written; old results stay for now.
+
+        Raises:
+            ResultsError: it cannot, or a file is in its place.
+        """
+        path = self._directory
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=path):
+                pass
+            for path in map(self._directory.joinpath, FILES):
+                if path.is_dir():
+                    raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        except OSError as error:
+            raise cannot_write(path, error) from error
+
+    def started(self, start: RunStart) -> None:
+        """Replace old results by new files with the row of T_0.
+
+        Raises:
+            ResultsError: a file cannot be written.
+        """
+        self.prepare()
+        columns = Columns.of(start)
+        try:
+            self._open_files(columns)
+            self._append((Point(start.start_time, start.outputs, start.discrete),))
+            self._flush()
+            about = about_columns(columns, self._settings)
+            write_json(self._directory / START_FILE, plain_mapping(about))
+        except ResultsError:
+            with suppress(ResultsError):
+                self._close()
+            raise
+        self._start = start
+
+    def attempted(self, attempt: Attempt) -> None:
+        """Note the attempt and the points it reached.
+
+        Raises:
+            ResultsError: a file cannot be written; what it held before stays readable.
+        """
+        if self._steps is not None:
+            self._steps.append(attempt)
+        self._append(attempt.points)
+        if monotonic() >= self._next_flush:
+            self._flush()
+
+    def ended(self, end: RunEnd) -> None:
+        """Write what is left, the formats that are made at the end, and the summary.
+
+        Raises:
+            ResultsError: a file cannot be written and nobody was told so before.
+        """
+        if self._start is None:
+            return
+        told = self._broken
+        errors: list[ResultsError] = []
+        summary = summarize(self._start, end, self._settings)
+        self._append(end.points)
+        for finish in (
+            self._flush,
+            self._close,
+            self._convert,
+            lambda: self._write_summary(summary),
+        ):
+            try:
+                finish()
+            except ResultsError as error:  # each file gets its chance: the disk may have room
+                errors.append(error)
+        if errors and not told:
+            raise errors[0]
+
+    @property
+    def _stream(self) -> Path:
+        """The file that Parquet and MAT are made from."""
+        return self._directory / (ARROW_FILE if "arrow" in self._formats else STREAM_FILE)
+
+    @property
+    def _made_at_the_end(self) -> bool:
+        return "parquet" in self._formats or "mat" in self._formats
+
+    def _open_files(self, columns: Columns) -> None:
+        path = self._directory
+        try:
+            for path in map(self._directory.joinpath, FILES):
+                path.unlink(missing_ok=True)
+            if "csv" in self._formats:
+                path = self._directory / RESULTS_FILE
+                self._results.append(CsvFile(path, columns))
+            if "arrow" in self._formats or self._made_at_the_end:
+                # pyarrow takes a tenth of a second to import, which other runs need not pay
+                from master_node.results.arrow_file import ArrowFile  # noqa: PLC0415
+
+                path = self._stream
+                hash_ = settings_sha256(self._settings)
+                self._results.append(ArrowFile(path, columns, hash_))
+            path = self._directory / STEPS_FILE
+            self._steps = StepsFile(path, columns.names)
+        except OSError as error:
+            raise cannot_write(path, error) from error
+
+    def _append(self, points: Points) -> None:
+        for file in self._results:
+            for point in points:
+                file.append(point)
+
+    def _flush(self) -> None:
+        self._each(lambda file: file.flush())
+        self._next_flush = monotonic() + FLUSH_INTERVAL
+
+    def _close(self) -> None:
+        try:
+            self._each(lambda file: file.close())
+        finally:
+            self._results, self._steps = [], None
+
+    def _each(self, action: Callable[[ResultsFile | StepsFile], None]) -> None:
+        errors: list[ResultsError] = []
+        for file in (*self._results, self._steps):
+            if file is None:
+                continue
+            try:
+                action(file)
+            except OSError as error:
+                errors.append(cannot_write(file.path, error))
+            except ResultsError as error:
+                errors.append(error)
+        if errors:
+            self._broken = True
+            raise errors[0]
+
+    def _convert(self) -> None:
+        """Parquet and MAT; where one fails, the stream stays in their place."""
+        if not self._made_at_the_end:
+            return
+        errors: list[ResultsError] = []
+        for format_, make in (("parquet", self._make_parquet), ("mat", self._make_mat)):
+            if format_ in self._formats:
+                try:
+                    make()
+                except ResultsError as error:
+                    errors.append(error)
+        if errors:
+            raise errors[0]
+        with suppress(OSError):
+            (self._directory / STREAM_FILE).unlink(missing_ok=True)
+
+    def _make_parquet(self) -> None:
+        from master_node.results.parquet_file import write_parquet  # noqa: PLC0415  as pyarrow
+
+        write_parquet(self._directory / PARQUET_FILE, self._stream)
+
+    def _make_mat(self) -> None:
+        from master_node.results.dymola_mat import constants_of, write_mat  # noqa: PLC0415  as above
+
+        write_mat(self._directory / MAT_FILE, self._stream, constants_of(self._settings))
+
+    def _write_summary(self, summary: Mapping[str, object]) -> None:
+        write_json(self._directory / SUMMARY_FILE, summary)
+        with suppress(OSError):
+            (self._directory / START_FILE).unlink(missing_ok=True)
