@@ -709,7 +709,7 @@ def test_what_is_no_run_is_not_removed(tmp_path: Path) -> None:
 def test_the_example_is_valid(tmp_path: Path) -> None:
     """All cases of all study files of the examples."""
     files = sorted((EXAMPLES.parent / "sweep").glob("*.toml"))
-    assert len(files) == 3
+    assert len(files) == 4
     for file in files:
         assert make_plan(load_study(file)).runs
 
