@@ -18,7 +18,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import click
 import kubernetes_validate
 import pytest
 import yaml
@@ -48,8 +47,7 @@ def check_command(words: Sequence[str]) -> None:
     """A command line that our programs take."""
     program, name, *rest = words
     command = get_command(APPS[program])
-    assert isinstance(command, click.Group)
-    command.commands[name].make_context(name, list(rest))
+    command.commands[name].make_context(name, list(rest))  # type: ignore[attr-defined]
 
 
 def endpoints(words: Sequence[str]) -> list[str]:
@@ -86,7 +84,7 @@ def test_the_commands_of_a_service_can_be_given(name: str) -> None:
     """Options exist, hosts are services, slaves are called as their service, models are built."""
     service = SERVICES[name]
     check_command(service["command"])
-    known = {*SERVICES, "127.0.0.1", "0.0.0.0"}  # noqa: S104  where the router listens
+    known = {*SERVICES, "127.0.0.1", "0.0.0.0"}
     assert set(endpoints(service["command"])) <= known
     assert set(service.get("depends_on", {})) <= set(SERVICES)
     if "healthcheck" in service:
@@ -143,7 +141,7 @@ def build_stages() -> list[list[str]]:
 
 
 def test_the_image_is_pinned_and_has_neither_compiler_nor_root() -> None:
-    """An exact tag for all stages; the last one installs nothing and ends as a user with a number."""
+    """An exact tag for all stages; the last installs nothing and ends as a user with a number."""
     text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
     (base,) = re.findall(r"^ARG PYTHON=(.*)$", text, re.MULTILINE)
     assert re.fullmatch(r"python:3\.\d+\.\d+-slim-\w+(@sha256:[0-9a-f]{64})?", base)
@@ -169,6 +167,7 @@ def test_what_the_image_is_built_from_is_sent_to_the_builder() -> None:
     assert all((ROOT / name).exists() for name in copied)
 
 
+@pytest.mark.timeout(1860)
 def test_containers_run_where_there_is_an_engine() -> None:
     """The documented script, for real: the results come out on the host."""
     done = subprocess.run(
@@ -181,11 +180,6 @@ def test_containers_run_where_there_is_an_engine() -> None:
     if done.returncode == 77:
         pytest.skip(done.stderr.strip())
     assert done.returncode == 0, done.stdout + done.stderr
-
-
-test_containers_run_where_there_is_an_engine = pytest.mark.timeout(1860)(
-    test_containers_run_where_there_is_an_engine
-)
 
 
 class Processes:
@@ -207,9 +201,7 @@ class Processes:
 
     def start(self, command: Sequence[str]) -> subprocess.Popen[bytes]:
         """Start a service that stays."""
-        process = subprocess.Popen(
-            self.words(command), cwd=self._models, stdin=subprocess.DEVNULL
-        )
+        process = subprocess.Popen(self.words(command), cwd=self._models, stdin=subprocess.DEVNULL)
         self._started.append(process)
         return process
 
@@ -313,7 +305,7 @@ def test_a_manifest_is_valid(path: Path) -> None:
 
 
 def test_the_manifests_belong_together() -> None:
-    """One namespace, selectors that match their pods, and services for all hosts that are called."""
+    """One namespace, selectors that match their pods, services for all hosts that are called."""
     found = documents()
     (namespace,) = [d["metadata"]["name"] for d in found if d["kind"] == "Namespace"]
     others = [d for d in found if d["kind"] != "Namespace"]
@@ -333,7 +325,7 @@ def test_the_manifests_belong_together() -> None:
     assert set(pods()) == set(SERVICES)
     for command, health in containers_of_kubernetes().values():
         check_command(command)
-        assert set(endpoints(command)) <= {*services, "0.0.0.0"}  # noqa: S104  the router's
+        assert set(endpoints(command)) <= {*services, "0.0.0.0"}
         if health:
             check_command(health)
             assert set(endpoints(health)) <= {*services, "127.0.0.1"}
