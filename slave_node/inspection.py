@@ -39,6 +39,10 @@ def _model(description: SlaveDescription) -> Table:
         )
         or "none",
     }
+    if description.fixed_step_size is not None:
+        rows["only communication step size [s]"] = str(description.fixed_step_size)
+    if description.remarks:
+        rows["remarks"] = "; ".join(description.remarks)
     for name, value in rows.items():
         table.add_row(name, value or "-")
     return table

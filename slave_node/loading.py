@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -39,9 +40,16 @@ def load_slave(
         ModelError: the model is missing, unusable, not for this platform, or cannot be run so.
     """
     if _is_fmu(model):
-        from slave_node.fmu.fmi2 import Fmi2Slave  # noqa: PLC0415  a Python model needs no fmpy
+        from slave_node.fmu.loading import load_fmu  # noqa: PLC0415  a Python model needs no fmpy
 
-        slave: Slave = Fmi2Slave((base / model).resolve(), scratch, name, log_all=log_all)
+        slave: Slave = load_fmu(
+            (base / model).resolve(),
+            scratch,
+            name,
+            log_all=log_all,
+            structural_parameters=configuration.structural_parameters,
+        )
+        configuration = replace(configuration, structural_parameters={})
     else:
         from slave_node.model_slave import ModelSlave  # noqa: PLC0415  and an FMU no scipy
 
