@@ -405,6 +405,8 @@ class ControlledRun:
         remedy = "raise the tolerances or lower smallest_step_size"
         if self._limits.smallest == self._limits.largest:
             remedy = "raise the tolerances: a slave takes no other step size"
+        elif self._limits.quantum is not None and times.first == float(self._limits.quantum):
+            remedy = f"raise the tolerances: step sizes are multiples of {times.first!r} s"
         return StepSizeError(
             f"rejected at the smallest communication step size: {reason}",
             phase="double step",

@@ -193,7 +193,8 @@ class SlaveDescription:
         state_kind: how its state is saved.
         state_reason: why it is not saved natively; "" if it is.
         input_derivatives: how it follows polynomial inputs.
-        fixed_step_size: the only communication step size that it takes [s]; None: any.
+        fixed_step_size: the only step size that the model takes [s]; its node makes a
+            communication step of a whole number of them. None: any.
         default_step_size: that the model recommends [s]; None: it does not.
         units: definitions of the units of its variables, by name; a unit that is not among them
             is only a name.
