@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats.qmc import LatinHypercube
 
 from protocol.signals import FloatArray
 
@@ -48,6 +47,8 @@ def latin_hypercube(
     Returns:
         Shape (number, d).
     """
+    from scipy.stats.qmc import LatinHypercube  # noqa: PLC0415  slow, and grids do without it
+
     sampler = LatinHypercube(len(begin), rng=np.random.default_rng(seed))
     unit: FloatArray = sampler.random(number)
     columns = [

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points, version
 from typing import Any
 
-from master_node.co_simulation import check_capabilities
 from master_node.configuration import InputSettings, System
 from master_node.input_loading import load_signals
 from master_node.numerics.reductions import REDUCTIONS_OF_VALUES
@@ -18,7 +16,7 @@ from master_node.results.selection import check_variables, chosen
 from master_node.results.summary import settings_sha256
 from master_node.simulation import settings_of
 from master_node.start_values import start_values
-from master_node.step_size_rules import check_step_sizes
+from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.study.case import Case, apply_case
 from master_node.study.cases import cases_of
 from master_node.study.configuration import Study
@@ -27,8 +25,6 @@ from master_node.system_files import open_system
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.names import nearest
 from protocol.slave import SlaveDescription, VariableType
-
-log = logging.getLogger("master_node")
 
 _NO_INFLUENCE = ("bus", "system_file")
 """Settings that change nothing in the results of a run."""
@@ -81,8 +77,6 @@ def make_plan(study: Study) -> Plan:
             PlannedRun(number, case, check.fingerprint(number, case))
             for number, case in enumerate(cases, start=1)
         )
-    for warning in check.warnings:
-        log.warning("%s", warning)
     names = tuple(dict.fromkeys(name for case in cases for name in case))
     return Plan(study, runs, names)
 
@@ -123,7 +117,6 @@ class _Check:
             "version": version("doublestep"),
             "files": _hashes_of_input_files(system),
         }
-        self.warnings: dict[str, None] = {}
 
     def fingerprint(self, number: int, case: Case) -> str:
         """The fingerprint of a case that has no mistake."""
@@ -142,7 +135,7 @@ class _Check:
 
     def _resolve(self, system: System) -> CoupledSystem:
         span = (float(system.simulation.start_time), system.checked().simulation.end)
-        check_step_sizes(system)
+        check_step_sizes(with_fixed_steps(system, self._descriptions))
         if span not in self._signals:
             self._signals[span] = load_signals(system)
         coupled = resolve(system, self._descriptions, self._signals[span])
@@ -151,7 +144,6 @@ class _Check:
                 start_values(self._descriptions[name], settings.parameters)
             except ConfigurationError as error:
                 raise error.located(slave=name) from None
-        self.warnings |= dict.fromkeys(check_capabilities(coupled, system))
         return coupled
 
     def _check_outputs(self, coupled: CoupledSystem) -> None:

@@ -18,7 +18,7 @@ from master_node.study.directory import put_in_place
 from master_node.study.records import CASE_FILE, LOG_FILE, RunRecord, write_record
 from protocol.errors import DeadlineError, ResultsError
 
-END_TIME = 0.3
+END_TIME = 0.2
 """How long an interrupted run has to end by itself [s]; nothing that it wrote is kept."""
 
 _LATE_TIME = 2.0
