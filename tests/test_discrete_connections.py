@@ -144,7 +144,7 @@ def test_units_of_fmus_are_converted(capability_dir: Path) -> None:
     given = lags(folder, "units_metres", "units_millimetres", factor=1e3)
     assert (simulate(given, in_process=True)["b.y"] == converted["b.y"]).all()
     as_it_is = lags(folder, "units_metres", "units_millimetres", ignore_units=True)
-    assert not (simulate(as_it_is, in_process=True)["b.y"] == converted["b.y"]).all()
+    assert last(simulate(as_it_is, in_process=True), "b.y") != last(converted, "b.y")
 
 
 def test_units_of_other_dimensions_are_refused(capability_dir: Path) -> None:
