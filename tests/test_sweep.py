@@ -535,6 +535,35 @@ def test_what_was_run_is_not_run_again(tmp_path: Path) -> None:
     assert sorted(identities(out)) == ["0001", "0002"]
 
 
+def test_discrete_outputs_become_numbers_where_they_are(
+    capability_dir: Path, tmp_path: Path
+) -> None:
+    """An integer has a highest value; it is held between points, so it has no mean; texts neither.
+
+    And only what the system keeps can be a column.
+    """
+    (tmp_path / "car.toml").write_text(
+        "[simulation]\nstop_time = 1.0\n[results]\nvariables = ['!all.toggle_out']\n"
+        f"[slaves.model]\nmodel = '{capability_dir / 'event_mode3.fmu'}'\n"
+        f"[slaves.all]\nmodel = '{capability_dir / 'all_types2.fmu'}'\n"
+    )
+    text = '[parameters]\n"simulation.relative_tolerance" = 1e-5\n[results.outputs]\n'
+    column = 'x = {{ variable = "{}", reduce = "{}" }}\n'
+    for variable, reduce, words in (
+        ("model.level", "mean", "reduce = 'mean': model.level is held between the points"),
+        ("all.string_out", "last", "all.string_out is no number"),
+        ("all.toggle_out", "last", "no such output"),
+    ):
+        file = study_file(tmp_path, text + column.format(variable, reduce))
+        with pytest.raises(ConfigurationError) as info:
+            make_plan(load_study(file))
+        assert words in str(info.value)
+    file = study_file(tmp_path, text + column.format("model.level", "max"))
+    done = sweep(file, tmp_path / "out")
+    assert done.code == 0, done.text
+    assert [row["x"] for row in rows(tmp_path / "out")] == ["2.0"]
+
+
 class Command:
     """A sweep under way."""
 

@@ -150,7 +150,7 @@ class _Check:
         discrete = dict(zip(coupled.discrete.names, coupled.discrete.types, strict=True))
         names = (*coupled.output_names, *discrete)
         patterns = self._system.results.variables
-        check_variables(patterns, names, self._system.source)
+        check_variables(patterns, names, f"{self._study.source}: {self._system.source}")
         known = [
             name for name, is_kept in zip(names, chosen(patterns, names), strict=True) if is_kept
         ]
