@@ -188,6 +188,38 @@ def router(
 
 
 @app.command()
+def check(
+    name: Annotated[str, typer.Argument(help="Slave to look for [default: a router].")] = "",
+    connect: Annotated[
+        str, typer.Option(help="Router, or the slave itself where it listens.")
+    ] = DEFAULT_ENDPOINT,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
+    ] = False,
+    tls: Tls = None,
+    timeout: Annotated[float, typer.Option(min=0.1, help="For the connection [s].")] = 3.0,
+) -> None:
+    """Exit code 0 if NAME serves, 3 if not: for health checks of service managers."""
+    from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  each command imports what it needs
+    from slave_node.health import check_alive  # noqa: PLC0415
+
+    role = Role.SLAVE if name else Role.ROUTER
+    endpoints = Endpoints(
+        connect=(connect,),
+        insecure=insecure,
+        mode=Mode.CLIENT,
+        credentials=None if tls is None else Credentials(tls.absolute(), role),
+    )
+    if name:
+        check_name(name)
+    bus = ZenohBus(endpoints, timeout=timeout)
+    try:
+        check_alive(bus, name)
+    finally:
+        bus.close()
+
+
+@app.command()
 def certificates(
     directory: Annotated[
         Path, typer.Argument(metavar="DIR", help="Where the authority is, or will be.")
