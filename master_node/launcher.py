@@ -56,10 +56,16 @@ class Launcher:
     def launch(self, name: str, model: str, base: Path) -> SlaveKey:
         """Start a slave; its address on the bus, where it will appear.
 
+        One that was started under this name before is ended first; its log is continued.
+
         Raises:
             ConfigurationError: the process cannot be started.
         """
         key = SlaveKey(name, token_hex(4))
+        before = self._processes.get(name)
+        if before is not None:
+            before.kill()
+            before.wait(_KILL_TIME)
         command = [sys.executable, "-m", "slave_node", "serve", model]
         options = {
             "--base": str(base),
@@ -72,7 +78,7 @@ class Launcher:
             processor = self._processors[len(self._processes) % len(self._processors)]
             command += ["--processor", str(processor)]
         try:
-            with self._log(name).open("wb") as log:
+            with self._log(name).open("ab" if before else "wb") as log:
                 self._processes[name] = subprocess.Popen(
                     command,
                     stdin=subprocess.PIPE,
