@@ -208,6 +208,7 @@ class Checkpoints:
             self._number, position, results, self._files.position(), _counters(self._statistics)
         )
         if monotonic() - self._written >= self._interval:
+            self._update()
             self._write()
             self._written = monotonic()
 
@@ -246,7 +247,6 @@ class Checkpoints:
         assert self._place is not None
         place = self._place
         self._files.flush()
-        self._update()
         counters = dict(zip(_COUNTERS, place.counters, strict=True))
         run: Mapping[str, Any] = {
             "position": to_plain(place.position),

@@ -114,12 +114,20 @@ class Launcher:
         last = self._last_words(name)
         if code == _USAGE_EXIT_CODE:
             return ModelError(last, slave=name)
-        how = f"died by signal {-code}" if code < 0 else f"ended with exit code {code}"
         return SlaveLostError(
-            f"its process {how}; its log ends: {last}",
+            f"{self.how_ended(name)}; its log ends: {last}",
             slave=name,
             remedy=f"see {self._log(name)}",
         )
+
+    def how_ended(self, name: str) -> str:
+        """The same in a few words; "" while it runs or when it is not ours."""
+        process = self._processes.get(name)
+        code = process.poll() if process else None
+        if code is None:
+            return ""
+        how = f"died by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        return f"its process {how}"
 
     def wait_ended(self, name: str, timeout: float) -> DoublestepError | None:
         """The same after giving a dying process ``timeout`` seconds."""

@@ -149,6 +149,8 @@ class RestorableSlave:
                 if isinstance(reply.error, SlaveCrashedError):
                     failure = reply.error
             except (SlaveLostError, DeadlineError) as error:
+                if error.slave not in ("", self.name):
+                    raise  # another one is lost for good, and so is the run
                 failure = error
             if failure is None:
                 assert reply is not None

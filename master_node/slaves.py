@@ -58,6 +58,8 @@ class Slaves:
         """A lost slave's error with the exit code and last words of its process, if it is ours."""
         if self.launcher is None or not isinstance(error, SlaveLostError):
             return error
+        if self.restarts is not None:  # then it says itself what became of it
+            return error
         ended = self.launcher.wait_ended(error.slave, _DEATH_TIME)
         if ended is None:
             return error
@@ -140,10 +142,8 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
             remotes[name] = claim(keys[name])
 
         def why_ended(remote: RemoteSlave) -> str:
-            error = launcher.ended(remote.key.name)
-            if error is not None:
-                return error.cause
-            return "its process died" if remote.has_ended else ""
+            died = "its process died" if remote.has_ended else ""
+            return launcher.how_ended(remote.key.name) or died
 
         recovers = system.simulation.recovery == "auto"
         stack.enter_context(
