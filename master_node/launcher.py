@@ -66,6 +66,9 @@ class Launcher:
         if before is not None:
             before.kill()
             before.wait(_KILL_TIME)
+            if before.stdin is not None:
+                with suppress(OSError):
+                    before.stdin.close()
         command = [sys.executable, "-m", "slave_node", "serve", model]
         options = {
             "--base": str(base),

@@ -23,7 +23,12 @@ def _grandparent() -> int:
     return int(line.split()[1])
 
 
+def _refuse() -> None:
+    raise ValueError("not this step")
+
+
 _ACCIDENTS = {
+    "refuse": _refuse,
     "kill worker": lambda: os.kill(os.getpid(), signal.SIGKILL),
     "kill node": lambda: os.kill(os.getppid(), signal.SIGKILL),
     "kill master": lambda: os.kill(_grandparent(), signal.SIGKILL),
@@ -39,7 +44,7 @@ class Trapped(_Chassis):
     """A chassis with ``traps``, such as ``"0.1 kill worker, 0.2 crash"``: time and accident.
 
     Each happens once, at the first evaluation at that time or later: a file in ``folder`` tells.
-    Those that are ``always`` happen whenever a step gets there that is longer than ``step``.
+    What happens from the time ``always`` on happens again and again.
     """
 
     parameters = (
