@@ -102,6 +102,11 @@ class Resumed:
             _read(ResultPosition, run, "files"),
         )
 
+    @property
+    def rows(self) -> tuple[int, int]:
+        """How many rows of results and of steps count."""
+        return self.files.points, self.files.attempts
+
     def place(self, kind: type[_T]) -> tuple[_T, ResultMemory]:
         """The position, a value of type ``kind``, and what the results remember there.
 

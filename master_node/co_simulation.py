@@ -56,8 +56,9 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
         )
     warnings = []
     for part in coupled.parts:
+        warnings += [f"{part.name}: {remark}" for remark in part.description.remarks]
         can = part.description.capabilities
-        fixed = system.slaves[part.name].step_size
+        fixed = system.slaves[part.name].step_size or part.description.fixed_step_size
         if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:
             raise ConfigurationError(
                 f"{part.name}: the model cannot handle variable communication step sizes",
@@ -131,6 +132,8 @@ class CoSimulation:
         coupled: their connections.
         system: the settings.
         observer: is told of everything.
+        outputs: at T_0 of slaves that stand there already; None: they are
+            still to be initialized.
         checkpoints: are told where the run stands.
         resumed: where to go on, with slaves that can be restored; None: at T_0.
     """
@@ -139,6 +142,7 @@ class CoSimulation:
     coupled: CoupledSystem
     system: System
     observer: Observer
+    outputs: Outputs | None = None
     checkpoints: Checkpoints = NO_CHECKPOINTS
     resumed: Resumed | None = None
 
@@ -153,7 +157,9 @@ class CoSimulation:
         """
         settings = self.system.simulation
         scheme = CouplingScheme.of(self.coupled, self.system)
-        outputs = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
+        outputs = self.outputs
+        if outputs is None:
+            outputs = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
         self.group.restart_statistics()
         statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
         if self.resumed is not None:

@@ -31,7 +31,7 @@ class ProgressBar:
 
     def __init__(self, quiet: bool = False, console: Console | None = None) -> None:
         self._quiet = quiet
-        self._console = _StandardError(stderr=True) if console is None else console
+        self._console = StandardError(stderr=True) if console is None else console
         self._progress: Progress | None = None
         self._task = TaskID(0)
         self._start_time = 0.0
@@ -102,10 +102,11 @@ class ProgressBar:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-class _StandardError(Console):
+class StandardError(Console):
     """Rich ends the program when its pipe breaks; a run must not end because nobody looks."""
 
     def on_broken_pipe(self) -> None:
+        """Be silent from now on."""
         self.quiet = True
 
 

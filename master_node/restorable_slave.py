@@ -36,7 +36,7 @@ from protocol.errors import (
     SlaveLostError,
     StepRejectedError,
 )
-from protocol.slave import SlaveDescription
+from protocol.slave import SlaveDescription, StateKind
 
 log = logging.getLogger("master_node")
 
@@ -118,7 +118,8 @@ class RestorableSlave:
         self._describe(description)
 
     def _describe(self, description: SlaveDescription) -> None:
-        self._can_serialize = description.capabilities.can_serialize_state
+        is_native = description.state_kind == StateKind.NATIVE
+        self._can_serialize = is_native and description.capabilities.can_serialize_state
         if self._restart is None:
             self.log = CallLog(is_compact=not self._can_serialize, kept_steps=0)
         else:

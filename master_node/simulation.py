@@ -15,8 +15,11 @@ from master_node.checkpoint_files import CheckpointStore
 from master_node.checkpoints import Checkpoints, ResultPosition, Resumed
 from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.configuration import InputSettings, System
+from master_node.configure_slaves import configure
+from master_node.examinations import as_plain_data
 from master_node.input_loading import load_signals
 from master_node.observers import Observer, Observers
+from master_node.preparation import prepare
 from master_node.restorable_slave import RestorableSlave
 from master_node.results import (
     Recording,
@@ -29,7 +32,7 @@ from master_node.results import (
 from master_node.resumption import RunMode, can_be_saved, check_models, reopened, saved_system
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
-from master_node.step_size_rules import check_step_sizes
+from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.system import resolve
 from protocol.slave import SlaveDescription
 
@@ -151,35 +154,39 @@ def _run(
             check_models(resumption.saved, slaves.descriptions)
         restorable = _restorable(slaves, system, directory)
         links = {**slaves.links, **{slave.name: slave for slave in restorable}}
-        coupled = resolve(system, slaves.descriptions, signals)
-        for warning in check_capabilities(coupled, system):
+        given = system
+        descriptions = configure(links, system, slaves.descriptions)
+        system = with_fixed_steps(system, descriptions)
+        check_step_sizes(system)
+        warnings = check_capabilities(resolve(system, descriptions, signals), system)
+        for warning in warnings:
             log.warning("%s", warning)
+        group = SlaveGroup(links)
+        prepared = prepare(group, system, descriptions, signals)
+        coupled = resolve(prepared.system, prepared.descriptions, signals)
+        for warning in check_capabilities(coupled, prepared.system):
+            if warning not in warnings:
+                log.warning("%s", warning)
         wanted = system.results
         check_variables(
             wanted.variables, (*coupled.output_names, *coupled.discrete.names), system.source
         )
-        keepers: list[Observer] = [] if recording is None else [recording]
         resumed = None if resumption is None else resumption.resumed
-        writer = store = None
+        store = None
+        if resumption is not None:
+            store = resumption.store
+        elif directory is not None and _writes_checkpoints(given):
+            store = CheckpointStore(directory, saved_system(given, mode, slaves.descriptions))
+        keepers: list[Observer] = [] if recording is None else [recording]
+        writer = None
         if directory is not None:
-            if resumption is not None:
-                store = resumption.store
-            elif system.simulation.checkpoint_interval and can_be_saved(system):
-                saved = saved_system(system, mode, slaves.descriptions)
-                store = CheckpointStore(directory, saved)
-            writer = ResultsWriter(
-                directory,
-                settings_of(system, slaves.descriptions),
-                None if resumed is None else resumed.files[:2],
-                can_resume=store is not None,
-            )
+            settings = settings_of(prepared.system, prepared.descriptions)
+            settings["examinations"] = as_plain_data(prepared.examinations)
+            rows = None if resumed is None else resumed.rows
+            writer = ResultsWriter(directory, settings, rows, can_resume=store is not None)
             keepers.append(writer)
-        selected = SelectedResults(
-            Observers(keepers),
-            wanted.variables,
-            wanted.every,
-            SelectionMemory() if resumed is None else resumed.files.selection,
-        )
+        selection = SelectionMemory() if resumed is None else resumed.files.selection
+        selected = SelectedResults(Observers(keepers), wanted.variables, wanted.every, selection)
         observer = Observers([*observers, selected])
         checkpoints = Checkpoints(
             restorable,
@@ -188,7 +195,13 @@ def _run(
             None if writer is None else _ResultFiles(writer, selected),
             0 if resumed is None else resumed.checkpoint.number,
         )
-        CoSimulation(SlaveGroup(links), coupled, system, observer, checkpoints, resumed).run()
+        CoSimulation(
+            group, coupled, prepared.system, observer, prepared.outputs, checkpoints, resumed
+        ).run()
+
+
+def _writes_checkpoints(system: System) -> bool:
+    return bool(system.simulation.checkpoint_interval) and can_be_saved(system)
 
 
 @dataclass(frozen=True)
@@ -209,8 +222,7 @@ class _ResultFiles:
 
 def _restorable(slaves: Slaves, system: System, directory: Path | None) -> list[RestorableSlave]:
     """The slaves in front of which calls are noted: all or none."""
-    writes = directory is not None and system.simulation.checkpoint_interval
-    if slaves.restarts is None and not writes:
+    if slaves.restarts is None and (directory is None or not _writes_checkpoints(system)):
         return []
     return [
         RestorableSlave(

@@ -2,20 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
+from rich.text import Text
 
 from protocol.slave import SlaveDescription
+from slave_node.validation import Finding, Grade
 
 _STATE = {
     "native": "saved and restored by the model itself",
+    "fork": "saved by forking the process that holds the model",
+    "replay": "restored by doing everything again from the start time",
     "none": "cannot be saved: only a fixed communication step is possible (--estimator none)",
+}
+
+_INPUTS = {
+    "native": "yes",
+    "emulated": "no: its steps are split into substeps",
+    "none": "no",
 }
 
 
 def description_tables(description: SlaveDescription) -> list[Table]:
     """The model, its variables and its capabilities as tables."""
     return [_model(description), _variables(description)]
+
+
+def report_table(model: str, findings: Sequence[Finding]) -> Table:
+    """The report of ``slave-node validate``."""
+    table = Table(title=model, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in ("tried", "", "result", "so"):
+        table.add_column(column, overflow="fold")
+    for finding in findings:
+        style = _STYLES[finding.grade]
+        table.add_row(finding.what, Text(finding.grade, style), finding.result, finding.consequence)
+    return table
+
+
+_STYLES = {Grade.OK: "green", Grade.NOTE: "yellow", Grade.PROBLEM: "bold red"}
 
 
 def _model(description: SlaveDescription) -> Table:
@@ -26,9 +52,9 @@ def _model(description: SlaveDescription) -> Table:
         "generation tool": description.generation_tool,
         "guid": description.guid,
         "sha256": description.sha256,
-        "state": _STATE.get(description.state_kind, description.state_kind),
+        "state": _state(description),
         "state can be serialized": _yes(can.can_serialize_state),
-        "interpolates inputs": _yes(can.can_interpolate_inputs),
+        "interpolates inputs": _INPUTS[description.input_derivatives],
         "output derivatives up to order": str(can.max_output_derivative_order),
         "variable communication step size": _yes(can.can_handle_variable_step_size),
         "outputs follow inputs without a step": _yes(can.outputs_follow_inputs),
@@ -39,9 +65,18 @@ def _model(description: SlaveDescription) -> Table:
         )
         or "none",
     }
+    if description.fixed_step_size is not None:
+        rows["only communication step size [s]"] = str(description.fixed_step_size)
+    if description.remarks:
+        rows["remarks"] = "; ".join(description.remarks)
     for name, value in rows.items():
         table.add_row(name, value or "-")
     return table
+
+
+def _state(description: SlaveDescription) -> str:
+    reason = f" ({description.state_reason})" if description.state_reason else ""
+    return _STATE[description.state_kind] + reason
 
 
 def _variables(description: SlaveDescription) -> Table:

@@ -5,6 +5,7 @@ Each test starts the commands as a user does. Nothing may be left running after 
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import re
@@ -298,6 +299,121 @@ def test_the_same_bits_in_process_launched_and_by_hand(
         assert slave.wait() == 0
         assert "claimed by" in slave.text
         assert "released by" in slave.text
+
+
+def test_the_same_bits_whatever_the_version_of_fmi(
+    start: Start, tmp_path: Path, capability_dir: Path
+) -> None:
+    """Law: the halves of the quarter car in FMI 3.0 give the results of those in FMI 2.0."""
+    contents = []
+    for variant in ("no_derivatives", "fmi3"):
+        models = {name: capability_dir / f"{name}_{variant}.fmu" for name in ("chassis", "wheel")}
+        file = system_file(
+            tmp_path, **models, simulation="stop_time = 0.3\norder = 0\nderivative_points = 0\n"
+        )
+        output = tmp_path / variant
+        master = start("master_node", "run", file, "--no-plot", "--output", output)
+        assert master.wait() == 0, master.text
+        assert_summary(output, "completed")
+        contents.append([(output / name).read_bytes() for name in ("results.csv", "steps.csv")])
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize(
+    ("chassis", "wheel"),
+    [("chassis_me2", "wheel_me3"), ("chassis_fmi3_intermediate", "wheel_me2")],
+)
+def test_adapters_of_all_kinds_work_together(
+    start: Start, tmp_path: Path, capability_dir: Path, chassis: str, wheel: str
+) -> None:
+    """Model exchange and intermediate updates under polynomial inputs: the exact solution."""
+    file = system_file(tmp_path, capability_dir / f"{chassis}.fmu", capability_dir / f"{wheel}.fmu")
+    master = start("master_node", "run", file, "--no-plot", "--output", tmp_path / "results")
+    assert master.wait() == 0, master.text
+    result = assert_summary(tmp_path / "results", "completed")
+    assert max(result.steps["order"]) >= 2
+
+
+def test_halves_of_fmi_1_run(start: Start, tmp_path: Path, capability_dir: Path) -> None:
+    """They cannot step back: with fixed steps the error is that of held inputs, of first order."""
+    models = {name: capability_dir / f"{name}_fmi1.fmu" for name in ("chassis", "wheel")}
+    file = system_file(tmp_path, **models)
+    errors = []
+    for step_size in ("1e-3", "5e-4"):
+        output = tmp_path / step_size
+        fixed = ("--estimator", "none", "--step-size", step_size)
+        master = start("master_node", "run", file, *fixed, "--no-plot", "--output", output)
+        assert master.wait() == 0, master.text
+        result = Result.load(output)
+        assert result.time[-1] == pytest.approx(0.3)
+        errors.append(global_errors(result).max())
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)
+
+
+def test_events_of_fmus_are_stepped_up_to(
+    start: Start, tmp_path: Path, capability_dir: Path
+) -> None:
+    """Bounces of a ball in model exchange, and steps of a staircase with event mode: each is a
+    communication point, 4 and 5 of them in 2 s.
+    """
+    file = tmp_path / "events.toml"
+    file.write_text(
+        "[simulation]\nstop_time = 2.0\n"
+        + "".join(
+            f"[slaves.{name}]\nmodel = {toml(capability_dir / f'{model}.fmu')}\n"
+            for name, model in (
+                ("ball", "bouncing_ball_me3"),
+                ("stairs", "event_mode3"),
+                ("lag", "discards"),
+            )
+        )
+        + '[[connections]]\nfrom = "stairs.y"\nto = "lag.u"\n'
+    )
+    output = tmp_path / "results"
+    master = start("master_node", "run", file, "--in-process", "--no-plot", "--output", output)
+    assert master.wait() == 0, master.text
+    result = Result.load(output)
+    assert result.summary["discontinuities"] == 9
+    fall, speed = math.sqrt(2.0 / 9.81), 0.7 * math.sqrt(2.0 * 9.81)
+    bounces = fall + np.cumsum([0.0, *(2.0 * 0.7**i * speed / 9.81 for i in range(3))])
+    steps = 0.35 * np.arange(1, 6)
+    for event in (*bounces, *steps):
+        assert np.abs(result.time - event).min() < 1e-4
+
+
+def test_values_of_all_types_cross_the_versions(
+    start: Start, tmp_path: Path, capability_dir: Path
+) -> None:
+    """From FMI 3.0 to 2.0 and back over Zenoh: each output is that of its rule; a clock is told
+    of and left out.
+    """
+    file = tmp_path / "types.toml"
+    text = "[simulation]\nstop_time = 0.5\n"
+    for name, version in (("a", 3), ("b", 2), ("c", 3)):
+        text += f"[slaves.{name}]\nmodel = {toml(capability_dir / f'all_types{version}.fmu')}\n"
+    for source, target in (
+        ("a.float64_out", "c.float64_in"),
+        ("a.int8_out", "b.integer_in"),
+        ("b.integer_out", "c.int64_in"),
+        ("a.string_out", "b.string_in"),
+        ("b.string_out", "c.string_in"),
+        ("b.toggle_out", "c.boolean_in"),
+        ("a.binary_out", "c.binary_in"),
+        ("a.matrix_out[1,2]", "c.vector_in[3]"),
+    ):
+        text += f'[[connections]]\nfrom = "{source}"\nto = "{target}"\n'
+    file.write_text(text)
+    output = tmp_path / "results"
+    master = start("master_node", "run", file, "--no-plot", "--output", output)
+    assert master.wait() == 0, master.text
+    clock = "a: clock clock (triggered) is ignored"
+    assert clock in master.text
+    assert clock in (output / "logs" / "a.log").read_text()
+    result = Result.load(output)
+    end = {name: values[-1] for name, values in result.discrete.items()}
+    assert (end["a.int8_out"], end["b.integer_out"], end["c.int64_out"]) == (1, 2, 3)
+    assert end["c.string_out"] == "got got got "
+    assert not any("clock" in name for name in end)
 
 
 def test_simulate_launches_slaves_too(tmp_path: Path, fmu_dir: Path) -> None:
