@@ -139,10 +139,9 @@ def run(  # noqa: PLR0917  options of the command line
     with _interruptible(), ExitStack() as stack:
         if stay_with_parent:
             _end_with_parent()
-        from rich.console import Console  # noqa: PLC0415  each command imports what it needs
-
-        from master_node.progress import ProgressBar, summary_table  # noqa: PLC0415
-        from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
+        from master_node.progress import (  # noqa: PLC0415  each command imports what it needs
+            ProgressBar,
+        )
         from master_node.simulation import run as run_system  # noqa: PLC0415
         from master_node.study.case import apply_case, read_case  # noqa: PLC0415
         from master_node.system_files import open_system  # noqa: PLC0415
@@ -191,15 +190,43 @@ def run(  # noqa: PLR0917  options of the command line
             )
         except KeyboardInterrupt:
             raise InterruptedRunError("interrupted before the first step") from None
-        result = Result.load(output)
-        if not no_plot:
-            from master_node.plots import plot_result  # noqa: PLC0415  a second for matplotlib
+        _show(output, quiet=quiet, no_plot=no_plot)
 
-            plot_result(result, output / PLOT_FILE, show=False, variables=None)
-        if not quiet:
-            console = Console()
-            console.print(summary_table(result.summary))
-            console.print(f"results in {output}", highlight=False)
+
+def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
+    """What came out: a picture and the summary."""
+    from rich.console import Console  # noqa: PLC0415
+
+    from master_node.progress import summary_table  # noqa: PLC0415
+    from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
+
+    result = Result.load(directory)
+    if not no_plot:
+        from master_node.plots import plot_result  # noqa: PLC0415  a second for matplotlib
+
+        plot_result(result, directory / PLOT_FILE, show=False, variables=None)
+    if not quiet:
+        console = Console()
+        console.print(summary_table(result.summary))
+        console.print(f"results in {directory}", highlight=False)
+
+
+@app.command()
+def resume(
+    directory: ResultDirectory,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
+) -> None:
+    """Go on with the run in DIRECTORY that was interrupted or killed, with the settings it had."""
+    with _interruptible():
+        from master_node.progress import ProgressBar  # noqa: PLC0415
+        from master_node.simulation import resume as resume_run  # noqa: PLC0415
+
+        try:
+            resume_run(directory, observers=(ProgressBar(quiet=quiet),))
+        except KeyboardInterrupt:
+            raise InterruptedRunError("interrupted before the next step") from None
+        _show(directory, quiet=quiet, no_plot=no_plot)
 
 
 @app.command()

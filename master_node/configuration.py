@@ -124,6 +124,10 @@ class SimulationSettings(_Table):
             ``none`` where the order is chosen, else ``rest``.
         output_interval: write results at start_time + i output_interval [s], by dense output,
             instead of at the communication points.
+        recovery: ``auto``: a slave process that died is started again, restored, and the run goes
+            on; ``off``: it ends the run.
+        checkpoint_interval: wall-clock time between two checkpoints for ``master-node resume``
+            [s]; 0: none are written.
         examine: let the slaves take trial steps before the first step, see ``examinations.py``.
     """
 
@@ -150,6 +154,8 @@ class SimulationSettings(_Table):
     largest_step_size: Positive | None = None
     initial_history: Literal["rest", "none"] | None = None
     output_interval: Positive | None = None
+    recovery: Literal["auto", "off"] = "auto"
+    checkpoint_interval: NotNegative = 10.0
     examine: StrictBool = True
 
     @model_validator(mode="before")

@@ -56,10 +56,19 @@ class Launcher:
     def launch(self, name: str, model: str, base: Path) -> SlaveKey:
         """Start a slave; its address on the bus, where it will appear.
 
+        One that was started under this name before is ended first; its log is continued.
+
         Raises:
             ConfigurationError: the process cannot be started.
         """
         key = SlaveKey(name, token_hex(4))
+        before = self._processes.get(name)
+        if before is not None:
+            before.kill()
+            before.wait(_KILL_TIME)
+            if before.stdin is not None:
+                with suppress(OSError):
+                    before.stdin.close()
         command = [sys.executable, "-m", "slave_node", "serve", model]
         options = {
             "--base": str(base),
@@ -72,7 +81,7 @@ class Launcher:
             processor = self._processors[len(self._processes) % len(self._processors)]
             command += ["--processor", str(processor)]
         try:
-            with self._log(name).open("wb") as log:
+            with self._log(name).open("ab" if before else "wb") as log:
                 self._processes[name] = subprocess.Popen(
                     command,
                     stdin=subprocess.PIPE,
@@ -108,12 +117,20 @@ class Launcher:
         last = self._last_words(name)
         if code == _USAGE_EXIT_CODE:
             return ModelError(last, slave=name)
-        how = f"died by signal {-code}" if code < 0 else f"ended with exit code {code}"
         return SlaveLostError(
-            f"its process {how}; its log ends: {last}",
+            f"{self.how_ended(name)}; its log ends: {last}",
             slave=name,
             remedy=f"see {self._log(name)}",
         )
+
+    def how_ended(self, name: str) -> str:
+        """The same in a few words; "" while it runs or when it is not ours."""
+        process = self._processes.get(name)
+        code = process.poll() if process else None
+        if code is None:
+            return ""
+        how = f"died by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        return f"its process {how}"
 
     def wait_ended(self, name: str, timeout: float) -> DoublestepError | None:
         """The same after giving a dying process ``timeout`` seconds."""

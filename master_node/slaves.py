@@ -18,6 +18,7 @@ from master_node.configuration import System
 from master_node.launcher import Launcher
 from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
+from master_node.restarts import Restarts
 from master_node.slave_link import LocalSlave, SlaveLink
 from protocol.bus import DEFAULT_ENDPOINT
 from protocol.calls import Describe
@@ -30,6 +31,7 @@ from protocol.errors import (
     InterruptedRunError,
     SlaveLostError,
 )
+from protocol.keys import SlaveKey
 from protocol.slave import SlaveDescription
 from protocol.zenoh_bus import ZenohBus
 
@@ -44,15 +46,19 @@ class Slaves:
         links: to each of them.
         descriptions: what each said of itself.
         launcher: of those started here, None in process.
+        restarts: starts them again, None in process.
     """
 
     links: Mapping[str, SlaveLink]
     descriptions: Mapping[str, SlaveDescription]
     launcher: Launcher | None = None
+    restarts: Restarts | None = None
 
     def explain(self, error: DoublestepError) -> DoublestepError:
         """A lost slave's error with the exit code and last words of its process, if it is ours."""
         if self.launcher is None or not isinstance(error, SlaveLostError):
+            return error
+        if self.restarts is not None:  # then it says itself what became of it
             return error
         ended = self.launcher.wait_ended(error.slave, _DEATH_TIME)
         if ended is None:
@@ -123,22 +129,33 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
         presence = Presence(bus)
         keys |= presence.wait(found, keys, launcher, system.bus.discovery_timeout)
         remotes: dict[str, RemoteSlave] = {}
-        for name in system.slaves:
+        stack.callback(_release, remotes)
+
+        def claim(key: SlaveKey) -> RemoteSlave:
+            times = system.bus.step_timeout, system.bus.reconnect_time
             try:
-                remotes[name] = RemoteSlave(
-                    bus, keys[name], run, system.bus.step_timeout, system.bus.reconnect_time
-                )
+                return RemoteSlave(bus, key, run, *times)
             except DoublestepError as error:
-                raise error.located(slave=name, phase="claim") from None
-            stack.callback(remotes[name].release)
+                raise error.located(slave=key.name, phase="claim") from None
 
-        def has_ended(remote: RemoteSlave) -> bool:
-            return remote.has_ended or launcher.ended(remote.key.name) is not None
+        for name in system.slaves:
+            remotes[name] = claim(keys[name])
 
+        def why_ended(remote: RemoteSlave) -> str:
+            died = "its process died" if remote.has_ended else ""
+            return launcher.how_ended(remote.key.name) or died
+
+        recovers = system.simulation.recovery == "auto"
         stack.enter_context(
-            presence.guarded(list(remotes.values()), has_ended, system.bus.reconnect_time)
+            presence.guarded(
+                list(remotes.values()),
+                why_ended,
+                system.bus.reconnect_time,
+                lambda name: recovers and name in launched,
+            )
         )
-        slaves = Slaves(remotes, _describe(remotes), launcher)
+        restarts = Restarts(system, remotes, claim, launcher, presence, frozenset(launched))
+        slaves = Slaves(dict(remotes), _describe(remotes), launcher, restarts if recovers else None)
         try:
             yield slaves
         except (KeyboardInterrupt, InterruptedRunError):
@@ -148,6 +165,11 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
             if isinstance(error, DeadlineError) and error.slave in remotes:
                 remotes[error.slave].abort()
             raise slaves.explain(error) from error.__cause__
+
+
+def _release(remotes: Mapping[str, RemoteSlave]) -> None:
+    for remote in reversed(list(remotes.values())):
+        remote.release()
 
 
 def _describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
