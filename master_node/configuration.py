@@ -457,22 +457,28 @@ class BusSettings(_Table):
     """The ``[bus]`` table.
 
     Attributes:
+        mode: ``peer``: connected to each slave; ``client``: connected to a router, as all slaves.
         listen: where slaves that are not started by this master can connect to; default: the
             loopback port 7447 when there are such slaves and nothing to connect to.
-        connect: slaves that listen.
-        insecure: allow addresses other than loopback.
+        connect: slaves that listen, or the router; default of a client: the loopback port 7447.
+        insecure: allow addresses other than loopback without TLS.
+        tls: directory with certificates, relative to the system file; None: no TLS.
         discovery_timeout: how long to wait for slaves to appear [s].
         step_timeout: how long one request may take [s].
+        reconnect_time: how long to wait in mid run for a slave whose connection was lost [s].
         pin: keep the node and the worker of each launched slave on one processor, so that a
             request is handed over without waking another one. For small models; a model with
             threads of its own would have only that processor.
     """
 
+    mode: Literal["peer", "client"] = "peer"
     listen: tuple[StrictStr, ...] = ()
     connect: tuple[StrictStr, ...] = ()
     insecure: StrictBool = False
+    tls: StrictStr | None = None
     discovery_timeout: Positive = 30.0
     step_timeout: Positive = 60.0
+    reconnect_time: Annotated[Number, Field(gt=0, le=3000)] = 10.0
     pin: StrictBool = False
 
 
@@ -525,6 +531,11 @@ class System(_Table):
             except ConfigurationError as error:
                 raise ValueError(str(error)) from None
         return self
+
+    @property
+    def certificates(self) -> Path | None:
+        """The directory with certificates for TLS."""
+        return None if self.bus.tls is None else self.base / self.bus.tls
 
     def checked(self) -> Self:
         """The system itself, as nothing more can be added to it.

@@ -6,37 +6,34 @@ Each way is a context manager that gives a `Slaves` and leaves nothing running b
 from __future__ import annotations
 
 import tempfile
-import threading
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from secrets import token_hex
-from time import monotonic
 
+from master_node.announcement import announce_run
 from master_node.configuration import System
 from master_node.launcher import Launcher
-from master_node.remote_slave import RemoteSlave, slave_status
+from master_node.presence import Presence
+from master_node.remote_slave import RemoteSlave
 from master_node.slave_link import LocalSlave, SlaveLink
-from protocol.bus import DEFAULT_ENDPOINT, Bus
+from protocol.bus import DEFAULT_ENDPOINT
 from protocol.calls import Describe
+from protocol.credentials import Credentials, Role
+from protocol.endpoints import Endpoints, Mode, free_endpoint
 from protocol.errors import (
     ConfigurationError,
     DeadlineError,
     DoublestepError,
     InterruptedRunError,
-    ProtocolError,
     SlaveLostError,
 )
-from protocol.keys import SlaveKey, alive_master, alive_slaves
 from protocol.slave import SlaveDescription
-from protocol.zenoh_bus import Endpoints, ZenohBus, free_endpoint
+from protocol.zenoh_bus import ZenohBus
 
-_POLL_TIME = 0.02
-_RETURN_TIME = 0.5
 _DEATH_TIME = 1.0
-_LIVELINESS_TIME = 1.0
 
 
 @dataclass(frozen=True)
@@ -110,38 +107,46 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
     found = [name for name in system.slaves if name not in launched]
     private = free_endpoint()
     with ExitStack() as stack:
-        bus = ZenohBus(_endpoints(system, private, launched=bool(launched), found=bool(found)))
+        endpoints = _endpoints(system, private, launched=bool(launched), found=bool(found))
+        bus = ZenohBus(endpoints, timeout=system.bus.discovery_timeout)
         stack.callback(bus.close)
         run = token_hex(4)
-        bus.announce(alive_master(run))
-        launcher = stack.enter_context(Launcher(private, log_directory, pin=system.bus.pin))
+        announce_run(bus, run, system)
+        launcher = stack.enter_context(
+            Launcher(_connection(endpoints, private), log_directory, pin=system.bus.pin)
+        )
         keys = {
             name: launcher.launch(name, str(system.slaves[name].model), system.base)
             for name in system.slaves
             if name in launched
         }
-        presence = _Presence(bus)
+        presence = Presence(bus)
         keys |= presence.wait(found, keys, launcher, system.bus.discovery_timeout)
-        links: dict[str, SlaveLink] = {}
-        remotes = {}
+        remotes: dict[str, RemoteSlave] = {}
         for name in system.slaves:
             try:
-                remote = RemoteSlave(bus, keys[name], run, system.bus.step_timeout)
+                remotes[name] = RemoteSlave(
+                    bus, keys[name], run, system.bus.step_timeout, system.bus.reconnect_time
+                )
             except DoublestepError as error:
                 raise error.located(slave=name, phase="claim") from None
-            links[name] = remotes[keys[name].alive] = remote
-            stack.callback(remote.release)
-        presence.on_loss(remotes)
-        stack.callback(presence.on_loss, {})
-        slaves = Slaves(links, _describe(links), launcher)
+            stack.callback(remotes[name].release)
+
+        def has_ended(remote: RemoteSlave) -> bool:
+            return remote.has_ended or launcher.ended(remote.key.name) is not None
+
+        stack.enter_context(
+            presence.guarded(list(remotes.values()), has_ended, system.bus.reconnect_time)
+        )
+        slaves = Slaves(remotes, _describe(remotes), launcher)
         try:
             yield slaves
         except (KeyboardInterrupt, InterruptedRunError):
             launcher.stop(at_once=True)
             raise
         except DoublestepError as error:
-            if isinstance(error, DeadlineError) and error.slave in keys:
-                remotes[keys[error.slave].alive].abort()
+            if isinstance(error, DeadlineError) and error.slave in remotes:
+                remotes[error.slave].abort()
             raise slaves.explain(error) from error.__cause__
 
 
@@ -160,109 +165,39 @@ def _describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
 
 
 def _endpoints(system: System, private: str, *, launched: bool, found: bool) -> Endpoints:
-    listen = list(system.bus.listen)
-    if found and not listen and not system.bus.connect:
-        listen.append(DEFAULT_ENDPOINT)
-    if launched:
-        listen.append(private)
+    bus = system.bus
+    mode = Mode(bus.mode)
+    listen, connect = list(bus.listen), list(bus.connect)
+    if mode is Mode.CLIENT:
+        connect = connect or [DEFAULT_ENDPOINT]
+    else:
+        if found and not listen and not connect:
+            listen.append(DEFAULT_ENDPOINT)
+        if launched:
+            listen.append(private)
     try:
-        return Endpoints(tuple(listen), tuple(system.bus.connect), system.bus.insecure)
+        credentials = (
+            None
+            if system.certificates is None
+            else Credentials(system.certificates.absolute(), Role.MASTER)
+        )
+        return Endpoints(tuple(listen), tuple(connect), bus.insecure, mode, credentials)
     except ConfigurationError as error:
         raise ConfigurationError(
             f"{system.source}: [bus] {error.cause}", remedy=error.remedy
         ) from None
 
 
-class _Presence:
-    """Which slaves are on the bus, as their liveliness tokens come and go."""
-
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
-        self._changed = threading.Condition()
-        self._alive: set[SlaveKey] = set()
-        self._remotes: Mapping[str, RemoteSlave] = {}
-        bus.watch(alive_slaves(), self._told)
-
-    def _told(self, key: str, alive: bool) -> None:
-        slave = SlaveKey.from_alive(key)
-        if slave is None:
-            return
-        with self._changed:
-            (self._alive.add if alive else self._alive.discard)(slave)
-            self._changed.notify_all()
-        remote = self._remotes.get(key)
-        if remote is not None and not alive:
-            self._lost(remote)
-
-    def on_loss(self, remotes: Mapping[str, RemoteSlave]) -> None:
-        """From now on tell these slaves' links when their token goes away."""
-        with self._changed:
-            self._remotes = remotes
-            lost = [remote for remote in remotes.values() if remote.key not in self._alive]
-        for remote in lost:
-            self._lost(remote)
-
-    def _lost(self, remote: RemoteSlave) -> None:
-        remote.lost()
-        timer = threading.Timer(_RETURN_TIME, self._abandon, (remote.key,))
-        timer.daemon = True
-        timer.start()
-
-    def _abandon(self, gone: SlaveKey) -> None:
-        """A slave that stays away ends the run, however long the steps of the others take."""
-        with self._changed:
-            remotes = [] if gone in self._alive else list(self._remotes.values())
-        for remote in remotes:
-            remote.abandon(gone.name)
-
-    def wait(
-        self, names: list[str], keys: Mapping[str, SlaveKey], launcher: Launcher, timeout: float
-    ) -> dict[str, SlaveKey]:
-        """Wait until slaves called ``names`` and those at ``keys`` are alive.
-
-        Returns:
-            The keys of the slaves called ``names``.
-        """
-        deadline = monotonic() + timeout
-        while True:
-            launcher.check()
-            with self._changed:
-                alive = set(self._alive)
-                missing = [n for n in names if not any(k.name == n for k in alive)]
-                missing += [name for name, key in keys.items() if key not in alive]
-                if not missing:
-                    break
-                if monotonic() > deadline:
-                    raise self._not_found(missing, alive, timeout)
-                self._changed.wait(_POLL_TIME)
-        found = {}
-        for name in (*names, *keys):
-            tokens = self._bus.alive(alive_slaves(name), _LIVELINESS_TIME)
-            instances = [k for k in map(SlaveKey.from_alive, tokens) if k is not None]
-            if len(instances) > 1:
-                raise ProtocolError(
-                    f"{len(instances)} instances of {name!r}: "
-                    + ", ".join(self._whereabouts(k) for k in instances),
-                    slave=name,
-                    remedy="end all but one of them",
-                )
-            if name in names:
-                found[name] = instances[0]
-        return found
-
-    @staticmethod
-    def _not_found(missing: list[str], alive: set[SlaveKey], timeout: float) -> SlaveLostError:
-        there = ", ".join(sorted({k.name for k in alive})) or "no slave at all"
-        return SlaveLostError(
-            f"did not appear within {timeout:g} s; found on the bus: {there}",
-            slave=", ".join(missing),
-            phase="discovery",
-            remedy="start it with `slave-node serve MODEL --name NAME`, or check --connect "
-            "and --listen on both sides",
-        )
-
-    def _whereabouts(self, key: SlaveKey) -> str:
-        with suppress(DoublestepError):
-            status = slave_status(self._bus, key)
-            return f"{status.get('host')!s}/{status.get('pid')!s}"
-        return key.instance
+def _connection(endpoints: Endpoints, private: str) -> list[str]:
+    """The options by which a slave that is started here comes to the same bus."""
+    words = []
+    if endpoints.mode is Mode.CLIENT:
+        words = ["--mode", "client"]
+        words += [word for endpoint in endpoints.connect for word in ("--connect", endpoint)]
+    else:
+        words = ["--connect", private]
+    if endpoints.insecure:
+        words.append("--insecure")
+    if endpoints.credentials is not None:
+        words += ["--tls", str(endpoints.credentials.directory)]
+    return words

@@ -42,9 +42,11 @@ FOREVER = "stop_time = 1e6\nlargest_step_size = 1e-3\nsmallest_step_size = 1e-9\
 class Command:
     """A command in a process of its own; its standard error is read as it comes."""
 
-    def __init__(self, scratch: Path, module: str, *words: object) -> None:
+    def __init__(
+        self, scratch: Path, module: str, *words: object, prefix: Sequence[str] = ()
+    ) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", module, *map(str, words)],
+            [*prefix, sys.executable, "-m", module, *map(str, words)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
