@@ -119,7 +119,7 @@ def run(  # noqa: PLR0917  options of the command line
         from rich.console import Console  # noqa: PLC0415  each command imports what it needs
 
         from master_node.plots import plot_result  # noqa: PLC0415
-        from master_node.progress import ProgressBar, summary_table  # noqa: PLC0415
+        from master_node.progress import ProgressBar, UploadBar, summary_table  # noqa: PLC0415
         from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
         from master_node.simulation import run as run_system  # noqa: PLC0415
         from master_node.system_files import open_system  # noqa: PLC0415
@@ -162,6 +162,7 @@ def run(  # noqa: PLR0917  options of the command line
                 in_process=in_process,
                 launch=not no_launch,
                 observers=(ProgressBar(quiet=quiet),),
+                uploading=UploadBar(quiet=quiet),
             )
         except KeyboardInterrupt:
             raise InterruptedRunError("interrupted before the first step") from None
@@ -258,7 +259,7 @@ def list_(
     tls: Tls = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show the slaves, co-simulations and routers on the bus."""
+    """Show the slaves, agents, co-simulations and routers on the bus."""
     from rich.console import Console  # noqa: PLC0415
 
     from master_node.listing import listing_data, listing_tables  # noqa: PLC0415

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from time import monotonic
 
-from master_node.launcher import Launcher
+from master_node.launcher import Starter
 from master_node.remote_slave import RemoteSlave, slave_status
 from protocol.bus import Bus
 from protocol.errors import DoublestepError, ProtocolError, SlaveLostError
@@ -48,7 +48,11 @@ class Presence:
             (remote.returned if alive else remote.lost)()
 
     def wait(
-        self, names: list[str], keys: Mapping[str, SlaveKey], launcher: Launcher, timeout: float
+        self,
+        names: list[str],
+        keys: Mapping[str, SlaveKey],
+        starters: Sequence[Starter],
+        timeout: float,
     ) -> dict[str, SlaveKey]:
         """Wait until slaves called ``names`` and those at ``keys`` are alive.
 
@@ -57,12 +61,13 @@ class Presence:
 
         Raises:
             SlaveLostError: a slave did not appear within ``timeout`` seconds; says what was found.
-            ModelError, SlaveLostError: a launched one ended.
+            ModelError, SlaveLostError: one that was started ended.
             ProtocolError: two slaves of one name.
         """
         deadline = monotonic() + timeout
         while True:
-            launcher.check()
+            for starter in starters:
+                starter.check()
             with self._changed:
                 alive = set(self._alive)
                 missing = [n for n in names if not any(k.name == n for k in alive)]

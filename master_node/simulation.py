@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from master_node.agents import Uploading
 from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.configuration import InputSettings, System
 from master_node.input_loading import load_signals
@@ -73,6 +74,7 @@ def run(
     launch: bool = True,
     observers: Sequence[Observer] = (),
     recording: Recording | None = None,
+    uploading: Uploading | None = None,
 ) -> None:
     """Run a system; raises as `simulate`.
 
@@ -83,13 +85,16 @@ def run(
         launch: start slaves that have a model; False: find all of them on the bus.
         observers: are told of everything that happens.
         recording: is told of the results that the system asks for, as the files are.
+        uploading: told of models that are sent to agents.
     """
     settings = settings_of(system, {})
     check_step_sizes(system)
     signals = load_signals(system)
     if directory is not None:
         ResultsWriter(directory, settings).prepare()
-    with _slaves(system, directory, in_process=in_process, launch=launch) as slaves:
+    with _slaves(
+        system, directory, in_process=in_process, launch=launch, uploading=uploading
+    ) as slaves:
         coupled = resolve(system, slaves.descriptions, signals)
         for warning in check_capabilities(coupled, system):
             log.warning("%s", warning)
@@ -107,7 +112,12 @@ def run(
 
 @contextmanager
 def _slaves(
-    system: System, directory: Path | None, *, in_process: bool, launch: bool
+    system: System,
+    directory: Path | None,
+    *,
+    in_process: bool,
+    launch: bool,
+    uploading: Uploading | None,
 ) -> Iterator[Slaves]:
     if in_process:
         with slaves_in_process(system) as slaves:
@@ -116,7 +126,7 @@ def _slaves(
     with tempfile.TemporaryDirectory(prefix="doublestep-") as temporary:
         logs = Path(temporary) if directory is None else directory / "logs"
         logs.mkdir(exist_ok=True)
-        with slaves_on_bus(system, logs, launch=launch) as slaves:
+        with slaves_on_bus(system, logs, launch=launch, uploading=uploading) as slaves:
             yield slaves
 
 

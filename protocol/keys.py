@@ -8,8 +8,10 @@
     doublestep/masters/<run>/status                 queryable: what a master says of its run
     doublestep/routers/<router>/alive               liveliness token of a router
     doublestep/routers/<router>/status              queryable: what a router says of itself
+    doublestep/agents/<agent>/<instance>/<verb>     queryable: one verb of an agent
+    doublestep/agents/<agent>/<instance>/alive      liveliness token of an agent
 
-``<instance>`` is made anew by each slave process, so that a query can never reach two slaves of
+``<instance>`` is made anew by each slave or agent process, so that a query can never reach two of
 the same name, nor one that was started again in between.
 """
 
@@ -25,6 +27,11 @@ CLAIM = "claim"
 RELEASE = "release"
 STATUS = "status"
 ABORT = "abort"
+MODELS = "models"
+UPLOAD = "upload"
+START = "start"
+STOP = "stop"
+OUTPUT = "output"
 _ALIVE = "alive"
 
 _ROOT = "doublestep"
@@ -67,6 +74,36 @@ class SlaveKey:
         parts = key.split("/")
         if len(parts) == 5 and parts[:2] == [_ROOT, "slaves"] and parts[4] == _ALIVE:
             return SlaveKey(parts[2], parts[3])
+        return None
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class AgentKey:
+    """Address of one agent process on the bus."""
+
+    name: str
+    instance: str
+
+    def verb(self, verb: str) -> str:
+        """The key on which this agent serves ``verb``."""
+        return f"{_ROOT}/agents/{self.name}/{self.instance}/{verb}"
+
+    @property
+    def alive(self) -> str:
+        """The key of its liveliness token."""
+        return self.verb(_ALIVE)
+
+    @property
+    def status(self) -> str:
+        """The key on which it tells of itself."""
+        return self.verb(STATUS)
+
+    @staticmethod
+    def from_alive(key: str) -> AgentKey | None:
+        """The address in the key of a liveliness token; None when it is none of an agent."""
+        parts = key.split("/")
+        if len(parts) == 5 and parts[:2] == [_ROOT, "agents"] and parts[4] == _ALIVE:
+            return AgentKey(parts[2], parts[3])
         return None
 
 
@@ -123,6 +160,11 @@ class RouterKey:
 def alive_routers() -> str:
     """Matches the liveliness tokens of all routers."""
     return f"{_ROOT}/routers/*/{_ALIVE}"
+
+
+def alive_agents(name: str = "*") -> str:
+    """Matches the liveliness tokens of all agents, or of all those called ``name``."""
+    return f"{_ROOT}/agents/{name}/*/{_ALIVE}"
 
 
 def alive_slaves(name: str = "*") -> str:
