@@ -69,7 +69,7 @@ _START_TIME = 30.0
 _STOP_TIME = 10.0
 _CHUNK_TIME = 30.0
 _PAUSE = 0.1
-_ARRIVAL_TIME = 1.0  # an agent that waits for a master tries again every 0.2 s
+_ARRIVAL_TIME = 0.6  # who waits for a master tries again every 0.2 s
 _CHECK_PERIOD = 0.5
 
 
@@ -156,6 +156,7 @@ class Agents:
         self._run = run
         self._system = system
         self._uploading = uploading
+        self._arrived = monotonic() + _ARRIVAL_TIME
         self._deadline = monotonic() + system.bus.discovery_timeout
         self._placed: dict[str, _Placed] = {}
         self._ended: dict[str, DoublestepError] = {}
@@ -182,8 +183,8 @@ class Agents:
             ProtocolError: two agents of one name.
         """
         wanted = self._wanted(name)
-        arrived = monotonic() + _ARRIVAL_TIME
         waiting = False
+        sleep(max(0.0, self._arrived - monotonic()))  # choose among all of them
         while True:
             seen = self._seen()
             suitable = _suitable(seen, wanted.settings)
@@ -199,8 +200,7 @@ class Agents:
                 if monotonic() > self._deadline:
                     raise error.located(slave=name, phase="start") from None
             except ConfigurationError as error:
-                if monotonic() > min(arrived, self._deadline):
-                    raise error.located(slave=name, phase="start") from None
+                raise error.located(slave=name, phase="start") from None
             except _UnsuitableError:
                 if monotonic() > self._deadline:
                     raise self._nobody(wanted, seen) from None
