@@ -86,6 +86,10 @@ def run(  # noqa: PLR0917  options of the command line
     step_size: Annotated[
         float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
     ] = None,
+    state: Annotated[
+        str | None,
+        typer.Option(help="How all slaves save their states: native, fork, replay or none."),
+    ] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Run the slaves in this process, without a bus.")
     ] = False,
@@ -110,6 +114,9 @@ def run(  # noqa: PLR0917  options of the command line
     ] = None,
     pin: Annotated[
         bool, typer.Option("--pin", help="Keep each launched slave on one processor.")
+    ] = False,
+    no_examine: Annotated[
+        bool, typer.Option("--no-examine", help="Let the slaves take no trial steps first.")
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
@@ -139,7 +146,9 @@ def run(  # noqa: PLR0917  options of the command line
                 start_time=start_time,
                 stop_time=stop_time,
                 initial_step_size=step_size,
+                examine=False if no_examine else None,
             )
+            .with_slaves(state=state)
             .with_bus(
                 connect=tuple(connect or ()),
                 listen=tuple(listen or ()),

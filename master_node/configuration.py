@@ -141,6 +141,7 @@ class SimulationSettings(_Table):
             ``none`` where the order is chosen, else ``rest``.
         output_interval: write results at start_time + i output_interval [s], by dense output,
             instead of at the communication points.
+        examine: let the slaves take trial steps before the first step, see ``examinations.py``.
     """
 
     preset: Literal["paper"] | None = None
@@ -166,6 +167,7 @@ class SimulationSettings(_Table):
     largest_step_size: Positive | None = None
     initial_history: Literal["rest", "none"] | None = None
     output_interval: Positive | None = None
+    examine: StrictBool = True
 
     @model_validator(mode="before")
     @classmethod
@@ -324,6 +326,11 @@ class SlaveSettings(_Table):
         smallest_step_size, largest_step_size: bounds of its communication steps [s].
         outputs_follow_inputs: whether its outputs can be read again after inputs were set, without
             a step in between (FMI 2.0 does not promise it); default: what is known of its kind.
+        input_substeps: into how many substeps its node splits each step, with constant inputs in
+            each, to follow polynomial inputs; 1: the inputs are constant in each step; 0: input
+            derivatives where the model takes them, else as many substeps as the accuracy needs.
+        largest_substep: its node splits steps so that no step of the model is longer [s].
+        state: how its state is saved; default: the best way that the model and its host allow.
     """
 
     model: StrictStr | None = None
@@ -340,6 +347,9 @@ class SlaveSettings(_Table):
     smallest_step_size: Positive | None = None
     largest_step_size: Positive | None = None
     outputs_follow_inputs: StrictBool | None = None
+    input_substeps: Annotated[StrictInt, Field(ge=0, le=10_000)] = 0
+    largest_substep: Positive | None = None
+    state: Literal["native", "fork", "replay", "none"] | None = None
 
     @model_validator(mode="after")
     def _agent_needs_model(self) -> Self:
@@ -595,6 +605,20 @@ class System(_Table):
             simulation |= {**_PAPER, "order": _PAPER["order"] if order == "auto" else order}
         simulation |= given
         return self._with(simulation=simulation)
+
+    def with_slave(self, name: str, **settings: Any) -> System:
+        """The same system with other settings of one slave."""
+        changed = self.slaves[name].model_dump(exclude_unset=True) | settings
+        return self._with(slaves={**self.slaves, name: changed})
+
+    def with_slaves(self, **settings: Any) -> System:
+        """The same system with other settings of all slaves; None leaves one as it is."""
+        given = {name: value for name, value in settings.items() if value is not None}
+        slaves = {
+            name: slave.model_dump(exclude_unset=True) | given
+            for name, slave in self.slaves.items()
+        }
+        return self._with(slaves=slaves)
 
     def with_bus(self, **settings: Any) -> System:
         """The same system with other bus settings; None and empty ones leave one as it is."""

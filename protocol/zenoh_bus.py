@@ -40,7 +40,7 @@ _TIMEOUT_PAYLOAD = b"Timeout"
 _CLIENT_ATTEMPT_MS = 300
 _PROBE_TIME = 2.0
 _PROBE_PERIOD = 1.0
-_OVERHEAD_BYTES = 2**20
+_DROPPED_BYTES = 4 * MAX_MESSAGE_BYTES  # what is shorter is refused with an answer
 _MAX_TOKENS = 4096
 _CLOSE_TIME = 1.0
 _REQUESTS_A_TOKEN = 512
@@ -66,7 +66,7 @@ def _config(endpoints: Endpoints) -> zenoh.Config:
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": _LEASE_MS,
         "transport/link/tx/queue/size/data": 16,
-        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES + _OVERHEAD_BYTES,
+        "transport/link/rx/max_message_size": _DROPPED_BYTES,
         "transport/shared_memory/enabled": False,
     }
     if endpoints.credentials is not None:
@@ -111,11 +111,15 @@ def _open_client(
     """Try until a router is there; a short time each, as an attempt cannot be interrupted."""
     where = ", ".join(endpoints.connect)
     end = None if timeout is None else time.monotonic() + timeout
+    told = False
     while not stop.is_set():
         begin = time.monotonic()
         try:
             return zenoh.open(_config(endpoints))
         except zenoh.ZError:
+            if not told:
+                log.info("waiting for a router at %s", where)
+                told = True
             attempts = probe_all(_secured(endpoints), endpoints.credentials, _PROBE_TIME)
             for attempt in attempts:
                 attempt.check()

@@ -76,6 +76,13 @@ def serve(  # noqa: PLR0917  options of the command line
     fmi_logging: Annotated[
         bool, typer.Option("--fmi-logging", help="Let the FMU log all categories.")
     ] = False,
+    state: Annotated[
+        str,
+        typer.Option(
+            help="How its state is saved unless the master asks for another way: native, fork, "
+            "replay or none [default: the best that the model and this host allow]."
+        ),
+    ] = "",
     base: Annotated[
         Path, typer.Option(help="Directory to which the model's path is relative.")
     ] = Path(),
@@ -100,7 +107,7 @@ def serve(  # noqa: PLR0917  options of the command line
         credentials=None if tls is None else Credentials(tls.absolute(), Role.SLAVE),
     )
     reference = ModelReference(
-        model, base.absolute(), key.name, _parameters(parameter or []), fmi_logging
+        model, base.absolute(), key.name, _parameters(parameter or []), fmi_logging, state
     )
     if processor is not None:
         os.sched_setaffinity(0, {processor})  # type: ignore[attr-defined,unused-ignore]  # Linux

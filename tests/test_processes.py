@@ -299,6 +299,39 @@ def test_the_same_bits_in_process_launched_and_by_hand(
         assert "released by" in slave.text
 
 
+def test_the_same_bits_whatever_the_version_of_fmi(
+    start: Start, tmp_path: Path, capability_dir: Path
+) -> None:
+    """Law: the halves of the quarter car in FMI 3.0 give the results of those in FMI 2.0."""
+    contents = []
+    for variant in ("no_derivatives", "fmi3"):
+        models = {name: capability_dir / f"{name}_{variant}.fmu" for name in ("chassis", "wheel")}
+        file = system_file(
+            tmp_path, **models, simulation="stop_time = 0.3\norder = 0\nderivative_points = 0\n"
+        )
+        output = tmp_path / variant
+        master = start("master_node", "run", file, "--no-plot", "--output", output)
+        assert master.wait() == 0, master.text
+        assert_summary(output, "completed")
+        contents.append([(output / name).read_bytes() for name in ("results.csv", "steps.csv")])
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize(
+    ("chassis", "wheel"),
+    [("chassis_me2", "wheel_me3"), ("chassis_fmi3_intermediate", "wheel_me2")],
+)
+def test_adapters_of_all_kinds_work_together(
+    start: Start, tmp_path: Path, capability_dir: Path, chassis: str, wheel: str
+) -> None:
+    """Model exchange and intermediate updates under polynomial inputs: the exact solution."""
+    file = system_file(tmp_path, capability_dir / f"{chassis}.fmu", capability_dir / f"{wheel}.fmu")
+    master = start("master_node", "run", file, "--no-plot", "--output", tmp_path / "results")
+    assert master.wait() == 0, master.text
+    result = assert_summary(tmp_path / "results", "completed")
+    assert max(result.steps["order"]) >= 2
+
+
 def test_simulate_launches_slaves_too(tmp_path: Path, fmu_dir: Path) -> None:
     """From Python: over Zenoh the same bits as in process, with direct feed-through."""
     system = load_system(EXAMPLES / "displacement_force_python.toml")

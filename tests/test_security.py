@@ -301,7 +301,7 @@ def test_a_slave_of_another_laboratory_is_refused(
     file = system_file(tmp_path, wheel=None)
     master = start(
         *("master_node", "run", file, "--output", tmp_path / "out", "--listen", endpoint),
-        *("--tls", laboratory, "--timeout", "8"),
+        *("--tls", laboratory, "--timeout", "5"),
     )
     early.wait_for("its certificate is not trusted")
     late = start(*slave, *where)
@@ -309,4 +309,4 @@ def test_a_slave_of_another_laboratory_is_refused(
     last = late.text.splitlines()[-1]
     assert re.match(rf"slave-node: connect: tls/{endpoint[4:]}: its certificate is not", last), last
     assert master.wait() == 3, master.text
-    assert "wheel: discovery: did not appear within 8 s" in master.text
+    assert "wheel: discovery: did not appear within 5 s" in master.text
