@@ -171,7 +171,7 @@ def run(  # noqa: PLR0917  options of the command line
                 in_process=in_process,
                 launch=not no_launch,
                 observers=(ProgressBar(quiet=quiet),),
-                uploading=UploadBar(quiet=quiet),
+                uploading=stack.enter_context(UploadBar(quiet=quiet)),
             )
         except KeyboardInterrupt:
             raise InterruptedRunError("interrupted before the first step") from None

@@ -141,7 +141,11 @@ def _problems_of(participant: Participant, timing: Timing) -> list[Problem]:
 
 
 def _duplicates(participants: Sequence[Participant]) -> list[Problem]:
-    named = Counter(described(p) for p in participants if isinstance(p.key, SlaveKey | AgentKey))
+    named = Counter(
+        described(p)
+        for p in participants
+        if isinstance(p.key, AgentKey) or (isinstance(p.key, SlaveKey) and not p.key.is_of_run)
+    )
     return [
         Problem(who, f"there are {count} of this name", "end all but one of them")
         for who, count in sorted(named.items())

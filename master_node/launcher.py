@@ -6,7 +6,6 @@ import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from secrets import token_hex
 from typing import Protocol, Self
 
 from protocol.errors import DoublestepError
@@ -45,14 +44,16 @@ class Launcher:
     A slave ends when its standard input closes: a launched process never outlives this one.
 
     Args:
+        run: its id.
         connection: options of ``slave-node serve`` that lead the slaves to the bus.
         log_directory: existing; gets ``NAME.log`` of each slave.
         pin: give each slave one processor of its own, in turn, where the platform can.
     """
 
     def __init__(
-        self, connection: Sequence[str], log_directory: Path, *, pin: bool = False
+        self, run: str, connection: Sequence[str], log_directory: Path, *, pin: bool = False
     ) -> None:
+        self._run = run
         self._connection = connection
         self._processors = _processors() if pin else []
         self._log_directory = log_directory
@@ -75,7 +76,7 @@ class Launcher:
         Raises:
             ConfigurationError: the process cannot be started.
         """
-        key = SlaveKey(name, token_hex(4))
+        key = SlaveKey.of_run(name, self._run)
         processor = None
         if self._processors:
             processor = self._processors[len(self._processes) % len(self._processors)]

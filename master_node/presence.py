@@ -62,7 +62,7 @@ class Presence:
         Raises:
             SlaveLostError: a slave did not appear within ``timeout`` seconds; says what was found.
             ModelError, SlaveLostError: one that was started ended.
-            ProtocolError: two slaves of one name.
+            ProtocolError: two slaves are found by one name.
         """
         deadline = monotonic() + timeout
         while True:
@@ -70,7 +70,7 @@ class Presence:
                 starter.check()
             with self._changed:
                 alive = set(self._alive)
-                missing = [n for n in names if not any(k.name == n for k in alive)]
+                missing = [n for n in names if not any(_is_called(n, k) for k in alive)]
                 missing += [name for name, key in keys.items() if key not in alive]
                 if not missing:
                     break
@@ -78,9 +78,10 @@ class Presence:
                     raise self._not_found(missing, alive, timeout)
                 self._changed.wait(_POLL_TIME)
         found = {}
-        for name in (*names, *keys):
+        for name in names:
             tokens = self._bus.alive(alive_slaves(name), _LIVELINESS_TIME)
-            instances = [k for k in map(SlaveKey.from_alive, tokens) if k is not None]
+            keys_there = (k for k in map(SlaveKey.from_alive, tokens) if k is not None)
+            instances = [k for k in keys_there if _is_called(name, k)]
             if len(instances) > 1:
                 raise ProtocolError(
                     f"{len(instances)} instances of {name!r}: "
@@ -88,8 +89,9 @@ class Presence:
                     slave=name,
                     remedy="end all but one of them",
                 )
-            if name in names:
-                found[name] = instances[0]
+            if not instances:  # it went away just now
+                raise self._not_found([name], alive, timeout)
+            found[name] = instances[0]
         return found
 
     @staticmethod
@@ -190,3 +192,8 @@ class Presence:
             remotes = list(self._remotes.values())
         for remote in remotes:
             remote.abandon(slave, cause)
+
+
+def _is_called(name: str, key: SlaveKey) -> bool:
+    """Whether a slave is found by ``name``; those that were started for a run are not."""
+    return key.name == name and not key.is_of_run

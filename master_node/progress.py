@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from time import monotonic
-from typing import Any
+from typing import Any, Self
 
 from rich.console import Console, RenderableType
 from rich.progress import (
@@ -114,6 +114,8 @@ class ProgressBar:
 class UploadBar:
     """Shows how far a model is on its way to an agent; nothing where there is no terminal.
 
+    A context, which leaves the terminal as it was.
+
     Args:
         quiet: print nothing at all.
         console: where to; standard error when None.
@@ -143,6 +145,16 @@ class UploadBar:
         self._progress.update(self._task, completed=sent.sent)
         self._progress.refresh()
         if sent.sent >= sent.size:
+            self._stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop()
+
+    def _stop(self) -> None:
+        if self._progress is not None:
             self._progress.stop()
             self._progress = None
 

@@ -127,7 +127,7 @@ def slaves_on_bus(
         run = token_hex(4)
         announce_run(bus, run, system)
         launcher = stack.enter_context(
-            Launcher(_connection(endpoints, private), log_directory, pin=system.bus.pin)
+            Launcher(run, _connection(endpoints, private), log_directory, pin=system.bus.pin)
         )
         agents = stack.enter_context(Agents(bus, run, system, uploading))
         starters = (launcher, agents)

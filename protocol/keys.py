@@ -12,13 +12,15 @@
     doublestep/agents/<agent>/<instance>/alive      liveliness token of an agent
 
 ``<instance>`` is made anew by each slave or agent process, so that a query can never reach two of
-the same name, nor one that was started again in between.
+the same name, nor one that was started again in between. That of a slave which was started for a
+run begins with the id of the run and a dash: it is for that run alone, and nobody finds it by name.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from secrets import token_hex
 
 from protocol.errors import ConfigurationError
 
@@ -67,6 +69,16 @@ class SlaveKey:
     def alive(self) -> str:
         """The key of its liveliness token."""
         return self.verb(_ALIVE)
+
+    @property
+    def is_of_run(self) -> bool:
+        """Whether it was started for one run; all others are found by name."""
+        return "-" in self.instance
+
+    @staticmethod
+    def of_run(name: str, run: str) -> SlaveKey:
+        """A new address of a slave that is started for a run."""
+        return SlaveKey(name, f"{run}-{token_hex(4)}")
 
     @staticmethod
     def from_alive(key: str) -> SlaveKey | None:

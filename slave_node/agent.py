@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from secrets import token_hex
 from shutil import rmtree
 from typing import TypeVar
 
@@ -259,7 +258,7 @@ class Agent:
                 raise SlaveBusyError(f"run {request.run} has ended, or has another such slave")
             self._check(request)
             base, model = self._model(request.model)
-            process = self._process(model, base, request.slave)
+            process = self._process(model, base, request.slave, request.run)
             self._runs.setdefault(request.run, _Run(request)).slaves[request.slave] = (
                 request,
                 process,
@@ -368,9 +367,9 @@ class Agent:
             )
         return self._offer.store.directory, model
 
-    def _process(self, model: str, base: Path, slave: str) -> SlaveProcess:
+    def _process(self, model: str, base: Path, slave: str, run: str) -> SlaveProcess:
         places = self._surroundings
-        key = SlaveKey(slave, token_hex(4))
+        key = SlaveKey.of_run(slave, run)
         scratch = places.scratch / key.instance
         log_file = (places.logs or places.scratch) / f"{slave}.{key.instance}.log"
         try:

@@ -63,7 +63,7 @@ from protocol.errors import (
     SlaveLostError,
     VersionError,
 )
-from protocol.keys import OUTPUT, START, STOP, UPLOAD, AgentKey, MasterKey
+from protocol.keys import MODELS, OUTPUT, START, STOP, UPLOAD, AgentKey, MasterKey, SlaveKey
 from slave_node.agent import Agent, Offer, Surroundings
 from slave_node.agent_options import default_cache, parse_labels, parse_licences, places_of
 from slave_node.certificates import Host, make_certificates
@@ -169,7 +169,7 @@ def slave_processes(agent: Command) -> dict[str, psutil.Process]:
 # ---- Runs ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("way", ["agents connect", "an agent listens", "router with TLS"])
+@pytest.mark.parametrize("way", ["agents connect", "agents listen", "through an agent with TLS"])
 def test_the_same_bits_with_slaves_of_two_agents(  # noqa: PLR0917  fixtures
     way: str,
     start: Commands,
@@ -177,25 +177,23 @@ def test_the_same_bits_with_slaves_of_two_agents(  # noqa: PLR0917  fixtures
     tmp_path: Path,
     fmu_dir: Path,
     reference: bytes,
-    endpoint: str,
 ) -> None:
     """Law: results.csv does not depend on who starts the slaves, nor on the way to them.
 
     One slave by the name of its agent, one by a licence. After the run nothing of it is left.
     """
-    tls: tuple[object, ...] = ()
-    first: tuple[object, ...] = ("--connect", endpoint)
+    one, two = endpoints(2)
+    first: tuple[object, ...] = ("--connect", one)
     then = first
-    bus = listening(endpoint)
-    if way == "an agent listens":
-        first, then = ("--listen", endpoint), (*then, "--mode", "client")
-        bus = f'connect = ["{endpoint}"]\n'
-    elif way == "router with TLS":
+    bus = listening(one)
+    if way == "agents listen":
+        first, then = ("--listen", one), ("--listen", two)
+        bus = f'connect = ["{one}", "{two}"]\n'
+    elif way == "through an agent with TLS":
         make_certificates(tmp_path / "laboratory", [Host.parse("here")], tuple(Role), 1)
         tls = ("--tls", tmp_path / "laboratory" / "here")
-        start("slave_node", "router", "--listen", endpoint, *tls).wait_for("ready")
-        first = then = ("--connect", endpoint, "--mode", "client", *tls)
-        bus = f'mode = "client"\nconnect = ["{endpoint}"]\ntls = "{tls[1]}"\n'
+        first, then = ("--listen", one, *tls), (*then, "--mode", "client", *tls)
+        bus = f'mode = "client"\nconnect = ["{one}"]\ntls = "{tls[1]}"\n'
     agents = [
         start_agent("winbox", "--label", "os=windows", *first),
         start_agent("lab", "--label", "licence=other", "--licence", "dymola=2", *then),
@@ -723,6 +721,8 @@ def test_a_master_waits_for_a_licence_and_says_who_has_it(
 ) -> None:
     """One licence, two masters: the second gives up after ``discovery_timeout``, or gets it when
     the first has ended. A system that needs more than there are is told so at once.
+
+    A slave without the licence runs meanwhile, under the same name: each run has its own.
     """
     mine, theirs = endpoints(2)
     start_agent(*("lab", "--licence", "dymola=1", "--connect", mine, "--connect", theirs))
@@ -738,6 +738,8 @@ def test_a_master_waits_for_a_licence_and_says_who_has_it(
     with pytest.raises(SlaveBusyError, match=r"all 1 licences dymola are taken: wheel of run .*"):
         simulate(load_system(file))
     assert time.monotonic() - begin >= 1.5
+    free = {"model": fmu_dir / "wheel.fmu", "host": "lab"}
+    simulate(load_system(system_file(tmp_path, chassis, free, bus=listening(mine))))
     file = system_file(tmp_path, chassis, wheel, bus=listening(mine))
     second = start("master_node", "run", file, "--output", tmp_path / "out", "--no-plot")
     second.wait_for("wheel waits: agent lab on")
@@ -770,6 +772,86 @@ def test_two_agents_of_one_name_are_refused(
     system = System(slaves={"wheel": {"model": "wheel.fmu", "host": "twin"}})
     with pytest.raises(ProtocolError, match=r"2 agents are called 'twin': host/1, host/2; end all"):
         Agents(bus, "r", system).start("wheel")
+
+
+class Listed:
+    """Agents on a bus that say what they have, and note what they are to start."""
+
+    def __init__(self, *statuses: AgentStatus, models: dict[str, tuple[AgentModel, ...]]) -> None:
+        self.bus = InProcessBus()
+        self.started: list[tuple[str, str]] = []
+        for status in statuses:
+            key = AgentKey(status.name, status.instance)
+            listed = ModelList(models.get(status.name, ()))
+            self.bus.serve(key.status, lambda _, status=status: encode_record(status))
+            self.bus.serve(key.verb(MODELS), lambda _, listed=listed: encode_record(listed))
+            self.bus.serve(key.verb(START), lambda data, name=key.name: self._start(name, data))
+            self.bus.announce(key.alive)
+
+    def _start(self, agent: str, data: bytes) -> bytes:
+        self.started.append((agent, decode_record(StartSlave, data).model))
+        return encode_record(SlaveStarted("r-0", 1))
+
+
+def test_which_agent_is_taken() -> None:
+    """That with the most free licences, then the first by name; one that has the model."""
+    wheel = AgentModel("wheel.fmu", "a" * 64, 1)
+    held = ("a", "b", "c")
+
+    def lab(name: str, total: int, holders: tuple[str, ...] = ()) -> AgentStatus:
+        return replace(STATUS, name=name, licences=(Licence("dymola", total, holders),))
+
+    agents = Listed(
+        *(lab("a", 1), lab("c", 3, held[:1]), lab("b", 2), lab("d", 5, held), lab("e", 9)),
+        replace(STATUS, name="f", labels={}, licences=()),
+        models=dict.fromkeys("abcdf", (wheel,)),
+    )
+    system = System(
+        slaves={
+            "wheel": {"model": "wheel.fmu", "requires": {"licence": "dymola"}},
+            "windows": {"model": "wheel.fmu", "requires": {"os": "windows"}},
+            "f": {"model": "folder/wheel.fmu", "host": "f"},
+        }
+    )
+    starter = Agents(agents.bus, "r", system)
+    for name in system.slaves:
+        starter.start(name)
+    assert agents.started == [("b", wheel.sha256), ("a", wheel.sha256), ("f", wheel.sha256)]
+
+
+def test_an_upload_outlives_a_lost_connection(tmp_path: Path) -> None:
+    """What was sent is not sent again, and the model that arrives is the one from here."""
+    bus = InProcessBus()
+    cache = UploadCache(tmp_path / "cache", 10 * MB, 10 * MB)
+    status = replace(STATUS, licences=(), upload_limit=10 * MB)
+    received: list[int] = []
+
+    def upload(data: bytes) -> bytes:
+        piece = decode_record(Upload, data)
+        received.append(piece.offset if piece.data else -1)
+        return encode_record(cache.receive(piece))
+
+    def serve() -> None:
+        bus.serve(KEY.status, lambda _: encode_record(status))
+        bus.serve(KEY.verb(MODELS), lambda _: encode_record(ModelList(())))
+        bus.serve(KEY.verb(UPLOAD), upload)
+        bus.serve(KEY.verb(START), lambda _: encode_record(SlaveStarted("r-0", 1)))
+        bus.announce(KEY.alive)
+
+    def lose(sent: Sent) -> None:
+        if sent.sent == CHUNK_BYTES:
+            bus.withdraw(KEY.alive)
+            threading.Timer(0.3, serve).start()
+
+    data = os.urandom(3 * CHUNK_BYTES)
+    (tmp_path / "wheel.fmu").write_bytes(data)
+    system = System(slaves={"wheel": {"model": "wheel.fmu", "host": "winbox"}}, base=tmp_path)
+    serve()
+    assert Agents(bus, "r", system, lose).start("wheel") == SlaveKey("wheel", "r-0")
+    assert received == [-1, 0, CHUNK_BYTES, 2 * CHUNK_BYTES]
+    path = cache.path(hashlib.sha256(data).hexdigest())
+    assert path is not None
+    assert path.read_bytes() == data
 
 
 def test_no_agent_has_what_is_required(
