@@ -209,4 +209,5 @@ def _endpoints(system: System, private: str, *, launched: bool, found: bool) -> 
 
 def _connection(endpoints: Endpoints, private: str) -> list[str]:
     """The options by which a slave that is started here comes to the same bus."""
-    return connection_options(endpoints, () if endpoints.mode is Mode.CLIENT else (private,))
+    connect = endpoints.connect if endpoints.mode is Mode.CLIENT else (private,)
+    return connection_options(endpoints.mode, connect, endpoints)

@@ -132,15 +132,16 @@ def end_all(processes: Iterable[SlaveProcess], *, at_once: bool = False) -> None
             process.wait(_KILL_TIME)
 
 
-def connection_options(endpoints: Endpoints, connect: Sequence[str] = ()) -> list[str]:
-    """The options of ``slave-node serve`` that lead a slave to the bus as ``endpoints`` do.
+def connection_options(mode: Mode, connect: Sequence[str], endpoints: Endpoints) -> list[str]:
+    """The options of ``slave-node serve`` that lead a slave to the bus.
 
     Args:
-        endpoints: of who starts the slave; what it listens on is not the slave's.
-        connect: addresses in place of those to which ``endpoints`` connect.
+        mode: peer or client.
+        connect: addresses.
+        endpoints: of who starts the slave, which is as safe.
     """
-    words = ["--mode", str(Mode.CLIENT)] if endpoints.mode is not Mode.PEER else []
-    words += [w for endpoint in connect or endpoints.connect for w in ("--connect", endpoint)]
+    words = ["--mode", str(mode)] if mode is not Mode.PEER else []
+    words += [word for endpoint in connect for word in ("--connect", endpoint)]
     if endpoints.insecure:
         words.append("--insecure")
     if endpoints.credentials is not None:

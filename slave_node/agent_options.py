@@ -41,14 +41,15 @@ def places_of(
     insecure: bool = False,
     tls: Path | None = None,
 ) -> Places:
-    """The slaves connect as their agent does; or to it, if it listens: it is a router then.
+    """The slaves connect as their agent does; or to it as its clients, if it listens.
+
+    A peer that listens passes on what its clients and other peers say to each other, so that it
+    needs the certificate of a router then.
 
     Raises:
         ConfigurationError: as `Endpoints` and `Credentials`.
     """
-    if listen and mode is Mode.PEER:
-        mode = Mode.ROUTER
-    role = Role.ROUTER if mode is Mode.ROUTER else Role.SLAVE
+    role = Role.ROUTER if listen else Role.SLAVE
     own = Endpoints(
         listen=tuple(listen),
         connect=tuple(connect or (() if listen else (DEFAULT_ENDPOINT,))),
@@ -56,7 +57,10 @@ def places_of(
         mode=mode,
         credentials=None if tls is None else Credentials(tls.absolute(), role),
     )
-    return Places(own, connection_options(own, [_here(endpoint) for endpoint in own.listen[:1]]))
+    if own.listen:
+        here = _here(own.listen[0])
+        return Places(own, connection_options(Mode.CLIENT, [here], own))
+    return Places(own, connection_options(mode, own.connect, own))
 
 
 def _here(endpoint: str) -> str:

@@ -998,7 +998,7 @@ def test_slaves_come_to_the_bus_as_their_agent_or_through_it() -> None:
     assert client.of_slaves == ["--mode", "client", "--connect", "tcp/127.0.0.1:1"]
     for listen, here in (("0.0.0.0", "127.0.0.1"), ("[::]", "[::1]"), ("10.0.0.1", "10.0.0.1")):
         places = places_of((), [f"tcp/{listen}:7"], Mode.PEER, insecure=True)
-        assert places.own.mode is Mode.ROUTER
+        assert places.own.mode is Mode.PEER
         assert places.own.connect == ()
         assert places.of_slaves == ["--mode", "client", "--connect", f"tcp/{here}:7", "--insecure"]
     assert places_of((), (), Mode.PEER).of_slaves == ["--connect", "tcp/127.0.0.1:7447"]
