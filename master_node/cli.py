@@ -141,6 +141,7 @@ def run(  # noqa: PLR0917  options of the command line
             _end_with_parent()
         from master_node.progress import (  # noqa: PLC0415  each command imports what it needs
             ProgressBar,
+            UploadBar,
         )
         from master_node.simulation import run as run_system  # noqa: PLC0415
         from master_node.study.case import apply_case, read_case  # noqa: PLC0415
@@ -187,6 +188,7 @@ def run(  # noqa: PLR0917  options of the command line
                 in_process=in_process,
                 launch=not no_launch,
                 observers=(ProgressBar(quiet=quiet),),
+                uploading=stack.enter_context(UploadBar(quiet=quiet)),
             )
         except KeyboardInterrupt:
             raise InterruptedRunError("interrupted before the first step") from None
@@ -385,7 +387,7 @@ def list_(
     tls: Tls = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show the slaves, co-simulations and routers on the bus."""
+    """Show the slaves, agents, co-simulations and routers on the bus."""
     from rich.console import Console  # noqa: PLC0415
 
     from master_node.listing import listing_data, listing_tables  # noqa: PLC0415

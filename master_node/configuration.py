@@ -33,6 +33,7 @@ from pydantic_core import ErrorDetails
 
 from master_node.numerics.dense_output import OutputGrid
 from master_node.numerics.extrapolation import InputPolynomial
+from protocol.agents import check_label
 from protocol.errors import ConfigurationError
 from protocol.keys import check_name
 from protocol.names import nearest
@@ -55,6 +56,22 @@ def _reference(value: str) -> str:
 def _pattern(value: str) -> str:
     if not value.removeprefix("!"):
         raise ValueError("write a pattern for slave.variable")
+    return value
+
+
+def _agent_name(value: str) -> str:
+    try:
+        return check_name(value, "agent name")
+    except ConfigurationError as error:
+        raise ValueError(str(error)) from None
+
+
+def _labels(value: Mapping[str, str]) -> Mapping[str, str]:
+    try:
+        for name, text in value.items():
+            check_label(name, text)
+    except ConfigurationError as error:
+        raise ValueError(str(error)) from None
     return value
 
 
@@ -305,6 +322,8 @@ class SlaveSettings(_Table):
     Attributes:
         model: an ``.fmu`` file, ``package.module:Class`` or ``file.py:Class``, relative to the
             system file; without it the slave is looked for on the bus, by name.
+        host: name of the agent that starts the slave; None: any that has what is required.
+        requires: labels of the agent that starts the slave; without both the master starts it.
         parameters: start values of parameters and other variables, by name.
         relative_tolerance, absolute_tolerance: for this slave's outputs.
         tolerances: for single outputs, by name.
@@ -321,6 +340,10 @@ class SlaveSettings(_Table):
     """
 
     model: StrictStr | None = None
+    host: Annotated[StrictStr, AfterValidator(_agent_name)] | None = None
+    requires: Annotated[Mapping[StrictStr, StrictStr], AfterValidator(_labels)] = Field(
+        default_factory=dict
+    )
     parameters: Mapping[str, Value] = Field(default_factory=dict)
     relative_tolerance: NotNegative | None = None
     absolute_tolerance: Positive | None = None
@@ -333,6 +356,17 @@ class SlaveSettings(_Table):
     input_substeps: Annotated[StrictInt, Field(ge=0, le=10_000)] = 0
     largest_substep: Positive | None = None
     state: Literal["native", "fork", "replay", "none"] | None = None
+
+    @model_validator(mode="after")
+    def _agent_needs_model(self) -> Self:
+        if self.needs_agent and self.model is None:
+            raise ValueError("an agent that starts the slave has to know its model")
+        return self
+
+    @property
+    def needs_agent(self) -> bool:
+        """Whether an agent has to start it."""
+        return self.host is not None or bool(self.requires)
 
 
 class Connection(_Table):

@@ -13,8 +13,9 @@ from master_node.plain_text import plain
 from master_node.survey import Participant, Timing, measure, survey
 from master_node.windows import Window
 from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
+from protocol.agents import AgentStatus
 from protocol.errors import SlaveLostError, VersionError
-from protocol.keys import MasterKey, SlaveKey
+from protocol.keys import AgentKey, MasterKey, SlaveKey
 
 _ROUNDS = 20
 _CLOCK_DIFFERENCE = 5.0
@@ -86,7 +87,7 @@ def diagnose(windows: Sequence[Window]) -> Diagnosis:
     for participant, timing in timings:
         problems += _problems_of(participant, timing)
     problems += _duplicates(participants)
-    if not any(isinstance(p.key, SlaveKey) for p in participants):
+    if not any(isinstance(p.key, SlaveKey | AgentKey) for p in participants):
         problems.append(
             Problem(
                 "bus",
@@ -103,6 +104,8 @@ def described(participant: Participant) -> str:
     key = participant.key
     if isinstance(key, SlaveKey):
         return f"slave {key.name}"
+    if isinstance(key, AgentKey):
+        return f"agent {key.name}"
     return f"run {key.run}" if isinstance(key, MasterKey) else f"router {key.instance}"
 
 
@@ -138,10 +141,14 @@ def _problems_of(participant: Participant, timing: Timing) -> list[Problem]:
 
 
 def _duplicates(participants: Sequence[Participant]) -> list[Problem]:
-    names = Counter(p.key.name for p in participants if isinstance(p.key, SlaveKey))
+    named = Counter(
+        described(p)
+        for p in participants
+        if isinstance(p.key, AgentKey) or (isinstance(p.key, SlaveKey) and not p.key.is_of_run)
+    )
     return [
-        Problem(f"slave {name}", f"there are {count} of this name", "end all but one of them")
-        for name, count in sorted(names.items())
+        Problem(who, f"there are {count} of this name", "end all but one of them")
+        for who, count in sorted(named.items())
         if count > 1
     ]
 
@@ -151,6 +158,8 @@ def _state(participant: Participant) -> str:
         case SlaveStatus() as slave:
             held = "free" if slave.holder is None else f"held by {slave.holder}"
             return held if slave.worker == "alive" else f"{held}, worker {slave.worker}"
+        case AgentStatus() as agent:
+            return f"agent with {agent.models} models, {len(agent.slaves)} slaves run"
         case MasterStatus() as master:
             return f"runs {master.system}"
         case RouterStatus() as router:

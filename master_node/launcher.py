@@ -3,44 +3,65 @@
 from __future__ import annotations
 
 import os
-import shlex
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
-from secrets import token_hex
-from time import monotonic
-from typing import Self
+from typing import Protocol, Self
 
-from protocol.errors import ConfigurationError, DoublestepError, ModelError, SlaveLostError
+from protocol.errors import DoublestepError
 from protocol.keys import SlaveKey
+from protocol.slave_processes import SlaveProcess, describe_exit, end_all, end_error
 
-_END_TIME = 2.0
-_KILL_TIME = 5.0
-_TAIL_LINES = 5
-_USAGE_EXIT_CODE = 2
+
+class Starter(Protocol):
+    """Who has started slaves for a run, and can say what became of their processes."""
+
+    def check(self) -> None:
+        """Raise for the first slave process that has ended.
+
+        Raises:
+            ModelError: it ended because its model cannot be used.
+            SlaveLostError: it ended for any other reason.
+        """
+        ...
+
+    def ended(self, name: str) -> DoublestepError | None:
+        """Why the process of slave ``name`` ended; None while it runs or when it is not ours."""
+        ...
+
+    def how_ended(self, name: str) -> str:
+        """The same in a few words; "" while it runs or when it is not ours."""
+        ...
+
+    def wait_ended(self, name: str, timeout: float) -> DoublestepError | None:
+        """The error after giving a dying process ``timeout`` seconds."""
+        ...
+
+    def stop(self, *, at_once: bool = False) -> None:
+        """End all in a bounded time. Idempotent."""
+        ...
 
 
 class Launcher:
-    """The slave processes of one run.
+    """The slave processes of one run on this host; implements `Starter`.
 
     A slave ends when its standard input closes: a launched process never outlives this one.
 
     Args:
+        run: its id.
         connection: options of ``slave-node serve`` that lead the slaves to the bus.
         log_directory: existing; gets ``NAME.log`` of each slave.
         pin: give each slave one processor of its own, in turn, where the platform can.
     """
 
     def __init__(
-        self, connection: Sequence[str], log_directory: Path, *, pin: bool = False
+        self, run: str, connection: Sequence[str], log_directory: Path, *, pin: bool = False
     ) -> None:
+        self._run = run
         self._connection = connection
         self._processors = _processors() if pin else []
         self._log_directory = log_directory
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._processes: dict[str, SlaveProcess] = {}
         # What a slave that is killed leaves behind goes with it.
         self._scratch = tempfile.TemporaryDirectory(
             prefix="doublestep-", ignore_cleanup_errors=True
@@ -54,131 +75,64 @@ class Launcher:
         self.stop(at_once=kind is not None and issubclass(kind, KeyboardInterrupt))
 
     def launch(self, name: str, model: str, base: Path) -> SlaveKey:
-        """Start a slave; its address on the bus, where it will appear.
-
-        One that was started under this name before is ended first; its log is continued.
+        """Start a slave, in place of the one of that name; its address, where it will appear.
 
         Raises:
             ConfigurationError: the process cannot be started.
         """
-        key = SlaveKey(name, token_hex(4))
+        key = SlaveKey.of_run(name, self._run)
         before = self._processes.get(name)
         if before is not None:
-            before.kill()
-            before.wait(_KILL_TIME)
-            if before.stdin is not None:
-                with suppress(OSError):
-                    before.stdin.close()
-        command = [sys.executable, "-m", "slave_node", "serve", model]
-        options = {
-            "--base": str(base),
-            "--name": name,
-            "--instance": key.instance,
-        }
-        command += [word for option in options.items() for word in option]
-        command += [*self._connection, "--stay-with-parent"]
+            end_all([before], at_once=True)
+        processor = None
         if self._processors:
             processor = self._processors[len(self._processes) % len(self._processors)]
-            command += ["--processor", str(processor)]
-        try:
-            with self._log(name).open("ab" if before else "wb") as log:
-                self._processes[name] = subprocess.Popen(
-                    command,
-                    stdin=subprocess.PIPE,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,  # Ctrl-C is for the master, who tells the slaves
-                    env=_environment(self._scratch.name),
-                )
-        except OSError as error:
-            raise ConfigurationError(
-                f"cannot start {shlex.join(command)}: {error}", slave=name
-            ) from error
+        self._processes[name] = SlaveProcess(
+            model,
+            base,
+            key,
+            connection=self._connection,
+            log=self._log_directory / f"{name}.log",
+            scratch=Path(self._scratch.name),
+            processor=processor,
+            goes_on=before is not None,
+        )
         return key
 
     def check(self) -> None:
-        """Raise for the first slave process that has ended.
-
-        Raises:
-            ModelError: it ended because its model cannot be used.
-            SlaveLostError: it ended for any other reason.
-        """
+        """See `Starter`."""
         for name in self._processes:
             error = self.ended(name)
             if error is not None:
                 raise error
 
     def ended(self, name: str) -> DoublestepError | None:
-        """Why the process of slave ``name`` ended; None while it runs or when it is not ours."""
+        """See `Starter`."""
         process = self._processes.get(name)
-        code = process.poll() if process else None
-        if code is None:
+        code = process.exit_code if process else None
+        if process is None or code is None:
             return None
-        last = self._last_words(name)
-        if code == _USAGE_EXIT_CODE:
-            return ModelError(last, slave=name)
-        return SlaveLostError(
-            f"{self.how_ended(name)}; its log ends: {last}",
-            slave=name,
-            remedy=f"see {self._log(name)}",
-        )
+        return end_error(name, code, process.last_lines(), f"see {process.log}")
 
     def how_ended(self, name: str) -> str:
-        """The same in a few words; "" while it runs or when it is not ours."""
+        """See `Starter`."""
         process = self._processes.get(name)
-        code = process.poll() if process else None
-        if code is None:
-            return ""
-        how = f"died by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        return f"its process {how}"
+        code = process.exit_code if process else None
+        return "" if code is None else f"its process {describe_exit(code)}"
 
     def wait_ended(self, name: str, timeout: float) -> DoublestepError | None:
-        """The same after giving a dying process ``timeout`` seconds."""
+        """See `Starter`."""
         process = self._processes.get(name)
         if process is not None:
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(timeout)
+            process.wait(timeout)
         return self.ended(name)
 
     def stop(self, *, at_once: bool = False) -> None:
-        """End all: ask, wait, kill. Idempotent."""
-        for process in self._processes.values():
-            if process.stdin is not None:
-                with suppress(OSError):
-                    process.stdin.close()
-            if at_once and process.poll() is None:
-                process.kill()
-        deadline = monotonic() + _END_TIME
-        for process in self._processes.values():
-            try:
-                process.wait(max(0.0, deadline - monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait(_KILL_TIME)
+        """See `Starter`: ask, wait, kill."""
+        end_all(self._processes.values(), at_once=at_once)
         self._scratch.cleanup()
-
-    def _log(self, name: str) -> Path:
-        return self._log_directory / f"{name}.log"
-
-    def _last_words(self, name: str) -> str:
-        with suppress(OSError):
-            text = self._log(name).read_text(encoding="utf-8", errors="replace")
-            lines = [line.strip() for line in text.splitlines() if line.strip()]
-            errors = [line for line in lines if line.startswith("slave-node: ")]
-            words = errors[-1:] or lines[-_TAIL_LINES:]
-            return " | ".join(word.removeprefix("slave-node: ") for word in words) or "nothing"
-        return "nothing"
 
 
 def _processors() -> list[int]:
     """The processors that this process may use; none where the platform does not tell."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-
-
-def _environment(scratch: str) -> dict[str, str]:
-    return {
-        **os.environ,
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-        "TMPDIR": scratch,
-    }

@@ -11,12 +11,15 @@ from rich.table import Table
 from master_node.plain_text import plain
 from master_node.survey import Participant
 from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
-from protocol.keys import MasterKey, SlaveKey
+from protocol.agents import AgentStatus
+from protocol.keys import AgentKey, MasterKey, SlaveKey
 
 
 def listing_tables(participants: Sequence[Participant]) -> list[Table]:
-    """Slaves, co-simulations and routers; no table for what there is none of."""
+    """Slaves, agents, co-simulations and routers; no table for what there is none of."""
     slaves = _table("Slaves", "name", "host", "model", "kind", "capabilities", "state", "since")
+    columns = ("name", "host", "labels", "licences free", "models", "slaves", "since")
+    agents = _table("Agents", *columns)
     runs = _table("Co-simulations", "run", "host", "system", "slaves", "since")
     routers = _table("Routers", "host", "addresses", "since")
     silent = _table("No answer", "key", "cause")
@@ -27,30 +30,48 @@ def listing_tables(participants: Sequence[Participant]) -> list[Table]:
                 since = _clock(s.since if s.held_since is None else s.held_since)
                 row = (s.name, s.host, s.model, s.kind, s.capabilities, s.state + held, since)
                 _add(slaves, *row)
+            case AgentStatus() as a:
+                _add(agents, *_agent_cells(a))
             case MasterStatus() as m:
                 _add(runs, m.run, f"{m.host} / {m.pid}", m.system, m.slaves, _clock(m.since))
             case RouterStatus() as r:
                 _add(routers, f"{r.host} / {r.pid}", r.endpoints, _clock(r.since))
             case None:
                 _add(silent, participant.key.alive, participant.failure)
-    return [table for table in (slaves, runs, routers, silent) if table.row_count]
+    return [table for table in (slaves, agents, runs, routers, silent) if table.row_count]
 
 
 def listing_data(participants: Sequence[Participant]) -> dict[str, list[dict[str, object]]]:
     """The same as plain data, with times in seconds since 1970."""
     data: dict[str, list[dict[str, object]]] = {
-        kind: [] for kind in ("slaves", "co_simulations", "routers", "silent")
+        kind: [] for kind in ("slaves", "agents", "co_simulations", "routers", "silent")
     }
     for participant in participants:
         if participant.status is None:
             data["silent"].append({"key": participant.key.alive, "cause": str(participant.failure)})
         elif isinstance(participant.key, SlaveKey):
             data["slaves"].append(asdict(participant.status))
+        elif isinstance(participant.key, AgentKey):
+            data["agents"].append(asdict(participant.status))
         elif isinstance(participant.key, MasterKey):
             data["co_simulations"].append(asdict(participant.status))
         else:
             data["routers"].append(asdict(participant.status))
     return data
+
+
+def _agent_cells(agent: AgentStatus) -> tuple[object, ...]:
+    taken = "uploads" if agent.upload_limit else ""
+    python = "Python" if agent.python else ""
+    return (
+        agent.name,
+        f"{agent.host} / {agent.pid}",
+        ", ".join(f"{name} = {value}" for name, value in agent.labels.items()),
+        ", ".join(f"{x.name} {x.free} of {x.total}" for x in agent.licences),
+        ", ".join(part for part in (str(agent.models), taken, python) if part),
+        ", ".join(f"{slave.name} of run {slave.run}" for slave in agent.slaves),
+        _clock(agent.since),
+    )
 
 
 def _table(title: str, *columns: str) -> Table:

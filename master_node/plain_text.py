@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from rich.text import Text
 
+from protocol.plain_text import printable
+
 _LONGEST = 200
 
 
 def plain(text: object) -> Text:
     """A cell of a table that shows ``text`` and does nothing else."""
-    shown = "".join(c if c.isprintable() else "?" for c in str(text)[: _LONGEST + 1])
+    shown = printable(str(text)[: _LONGEST + 1])
     return Text(shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}…")

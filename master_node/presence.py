@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from time import monotonic
 
-from master_node.launcher import Launcher
+from master_node.launcher import Starter
 from master_node.remote_slave import RemoteSlave, slave_status
 from protocol.bus import Bus
 from protocol.errors import DoublestepError, ProtocolError, SlaveLostError
@@ -49,7 +49,11 @@ class Presence:
             (remote.returned if alive else remote.lost)()
 
     def wait(
-        self, names: list[str], keys: Mapping[str, SlaveKey], launcher: Launcher, timeout: float
+        self,
+        names: list[str],
+        keys: Mapping[str, SlaveKey],
+        starters: Sequence[Starter],
+        timeout: float,
     ) -> dict[str, SlaveKey]:
         """Wait until slaves called ``names`` and those at ``keys`` are alive.
 
@@ -58,15 +62,16 @@ class Presence:
 
         Raises:
             SlaveLostError: a slave did not appear within ``timeout`` seconds; says what was found.
-            ModelError, SlaveLostError: a launched one ended.
-            ProtocolError: two slaves of one name.
+            ModelError, SlaveLostError: one that was started ended.
+            ProtocolError: two slaves are found by one name.
         """
         deadline = monotonic() + timeout
         while True:
-            launcher.check()
+            for starter in starters:
+                starter.check()
             with self._changed:
                 alive = set(self._alive)
-                missing = [n for n in names if not any(k.name == n for k in alive)]
+                missing = [n for n in names if not any(_is_called(n, k) for k in alive)]
                 missing += [name for name, key in keys.items() if key not in alive]
                 if not missing:
                     break
@@ -74,9 +79,10 @@ class Presence:
                     raise self._not_found(missing, alive, timeout)
                 self._changed.wait(_POLL_TIME)
         found = {}
-        for name in (*names, *keys):
+        for name in names:
             tokens = self._bus.alive(alive_slaves(name), _LIVELINESS_TIME)
-            instances = [k for k in map(SlaveKey.from_alive, tokens) if k is not None]
+            keys_there = (k for k in map(SlaveKey.from_alive, tokens) if k is not None)
+            instances = [k for k in keys_there if _is_called(name, k)]
             if len(instances) > 1:
                 raise ProtocolError(
                     f"{len(instances)} instances of {name!r}: "
@@ -84,11 +90,12 @@ class Presence:
                     slave=name,
                     remedy="end all but one of them",
                 )
-            if name in names:
-                found[name] = instances[0]
+            if not instances:  # it went away just now
+                raise self._not_found([name], alive, timeout)
+            found[name] = instances[0]
         return found
 
-    def wait_for(self, key: SlaveKey, launcher: Launcher, timeout: float) -> None:
+    def wait_for(self, key: SlaveKey, launcher: Starter, timeout: float) -> None:
         """Wait until a slave that was started again is alive.
 
         Raises:
@@ -237,3 +244,8 @@ class Presence:
             remotes = list(self._remotes.values())
         for remote in remotes:
             remote.abandon(slave, cause)
+
+
+def _is_called(name: str, key: SlaveKey) -> bool:
+    """Whether a slave is found by ``name``; those that were started for a run are not."""
+    return key.name == name and not key.is_of_run

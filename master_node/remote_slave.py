@@ -32,6 +32,11 @@ _ORPHAN_MARGIN = 5.0
 _LOSS_MARGIN = 1.0  # who watches the tokens says it earlier, and of whom
 
 
+def orphan_time(reconnect_time: float) -> float:
+    """How long a slave waits for a master that waits ``reconnect_time`` for it [s]."""
+    return reconnect_time + _ORPHAN_MARGIN
+
+
 def slave_status(bus: Bus, key: SlaveKey) -> dict[str, StartValue]:
     """What a slave says of itself."""
     return decode_map(bus.caller(key.verb(STATUS), _STATUS_TIME).request(b""))
@@ -70,7 +75,7 @@ class RemoteSlave:
         self._calls: Sequence[Call] = ()
         self._payload = b""
         self._pending: PendingReply | None = None
-        self._claim = Claim(run, socket.gethostname(), os.getpid(), reconnect_time + _ORPHAN_MARGIN)
+        self._claim = Claim(run, socket.gethostname(), os.getpid(), orphan_time(reconnect_time))
         self._take()
 
     def _take(self) -> None:

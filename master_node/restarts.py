@@ -40,6 +40,10 @@ class Restarts:
         self._presence = presence
         self._launched = launched
 
+    def is_mine(self, name: str) -> bool:
+        """Whether the slave of that name is one that can be started again here."""
+        return name in self._launched
+
     def restart(self, name: str) -> RemoteSlave:
         """A slave as it was loaded first.
 

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from master_node.agents import Uploading
 from master_node.checkpoint_files import CheckpointStore
 from master_node.checkpoints import Checkpoints, ResultPosition, Resumed
 from master_node.co_simulation import CoSimulation, check_capabilities
@@ -83,6 +84,7 @@ def run(
     launch: bool = True,
     observers: Sequence[Observer] = (),
     recording: Recording | None = None,
+    uploading: Uploading | None = None,
 ) -> None:
     """Run a system; raises as `simulate`.
 
@@ -93,8 +95,10 @@ def run(
         launch: start slaves that have a model; False: find all of them on the bus.
         observers: are told of everything that happens.
         recording: is told of the results that the system asks for, as the files are.
+        uploading: told of models that are sent to agents.
     """
-    _run(system, directory, RunMode(in_process, launch), observers, recording=recording)
+    mode = RunMode(in_process, launch)
+    _run(system, directory, mode, observers, recording=recording, uploading=uploading)
 
 
 def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None:
@@ -143,13 +147,14 @@ def _run(
     *,
     recording: Recording | None = None,
     resumption: Resumption | None = None,
+    uploading: Uploading | None = None,
 ) -> None:
     settings = settings_of(system, {})
     check_step_sizes(system)
     signals = load_signals(system)
     if directory is not None:
         ResultsWriter(directory, settings).prepare()
-    with _slaves(system, directory, mode) as slaves:
+    with _slaves(system, directory, mode, uploading) as slaves:
         if resumption is not None:
             check_models(resumption.saved, slaves.descriptions)
         restorable = _restorable(slaves, system, directory)
@@ -236,7 +241,9 @@ def _restorable(slaves: Slaves, system: System, directory: Path | None) -> list[
 
 
 @contextmanager
-def _slaves(system: System, directory: Path | None, mode: RunMode) -> Iterator[Slaves]:
+def _slaves(
+    system: System, directory: Path | None, mode: RunMode, uploading: Uploading | None
+) -> Iterator[Slaves]:
     if mode.in_process:
         with slaves_in_process(system) as slaves:
             yield slaves
@@ -244,7 +251,7 @@ def _slaves(system: System, directory: Path | None, mode: RunMode) -> Iterator[S
     with tempfile.TemporaryDirectory(prefix="doublestep-") as temporary:
         logs = Path(temporary) if directory is None else directory / "logs"
         logs.mkdir(exist_ok=True)
-        with slaves_on_bus(system, logs, launch=mode.launch) as slaves:
+        with slaves_on_bus(system, logs, launch=mode.launch, uploading=uploading) as slaves:
             yield slaves
 
 

@@ -1,4 +1,4 @@
-"""From the system's slaves to links: launched here, found on the bus, or in this process.
+"""From the system's slaves to links: launched here or by agents, found on the bus, or in process.
 
 Each way is a context manager that gives a `Slaves` and leaves nothing running behind it.
 """
@@ -6,16 +6,17 @@ Each way is a context manager that gives a `Slaves` and leaves nothing running b
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from secrets import token_hex
 
+from master_node.agents import Agents, Uploading
 from master_node.announcement import announce_run
 from master_node.configuration import System
-from master_node.launcher import Launcher
+from master_node.launcher import Launcher, Starter
 from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
 from master_node.restarts import Restarts
@@ -33,6 +34,7 @@ from protocol.errors import (
 )
 from protocol.keys import SlaveKey
 from protocol.slave import SlaveDescription
+from protocol.slave_processes import connection_options
 from protocol.zenoh_bus import ZenohBus
 
 _DEATH_TIME = 1.0
@@ -45,27 +47,28 @@ class Slaves:
     Attributes:
         links: to each of them.
         descriptions: what each said of itself.
-        launcher: of those started here, None in process.
-        restarts: starts them again, None in process.
+        starters: of those that were started for this run.
+        restarts: starts those of this host again, None in process.
     """
 
     links: Mapping[str, SlaveLink]
     descriptions: Mapping[str, SlaveDescription]
-    launcher: Launcher | None = None
+    starters: Sequence[Starter] = ()
     restarts: Restarts | None = None
 
     def explain(self, error: DoublestepError) -> DoublestepError:
         """A lost slave's error with the exit code and last words of its process, if it is ours."""
-        if self.launcher is None or not isinstance(error, SlaveLostError):
+        if not isinstance(error, SlaveLostError):
             return error
-        if self.restarts is not None:  # then it says itself what became of it
-            return error
-        ended = self.launcher.wait_ended(error.slave, _DEATH_TIME)
-        if ended is None:
-            return error
-        return SlaveLostError(ended.cause, remedy=ended.remedy).located(
-            slave=error.slave, phase=error.phase, time=error.time, step_size=error.step_size
-        )
+        if self.restarts is not None and self.restarts.is_mine(error.slave):
+            return error  # it says itself what became of it
+        for starter in self.starters:
+            ended = starter.wait_ended(error.slave, _DEATH_TIME)
+            if ended is not None:
+                return SlaveLostError(ended.cause, remedy=ended.remedy).located(
+                    slave=error.slave, phase=error.phase, time=error.time, step_size=error.step_size
+                )
+        return error
 
 
 @contextmanager
@@ -96,38 +99,52 @@ def slaves_in_process(system: System) -> Iterator[Slaves]:
 
 
 @contextmanager
-def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -> Iterator[Slaves]:
-    """Slaves over Zenoh: those with a model are started here, the others found by name.
+def slaves_on_bus(
+    system: System,
+    log_directory: Path,
+    *,
+    launch: bool = True,
+    uploading: Uploading | None = None,
+) -> Iterator[Slaves]:
+    """Slaves over Zenoh: started by agents or here, as the system says, or found by name.
 
     Args:
         system: what to run.
         log_directory: existing; gets the launched slaves' logs.
         launch: False: all slaves are expected on the bus.
+        uploading: told of models that are sent to agents.
 
     Raises:
         ConfigurationError: an address cannot be used, or a model cannot be loaded.
-        SlaveLostError: a slave did not appear in time; says what was found.
+        SlaveLostError: a slave or an agent did not appear in time; says what was found.
         ProtocolError: two slaves of one name, or a slave held by another master.
     """
-    launched = {n for n, s in system.slaves.items() if launch and s.model is not None}
-    found = [name for name in system.slaves if name not in launched]
+    started = {n for n, s in system.slaves.items() if launch and s.model is not None}
+    elsewhere = {name for name in started if system.slaves[name].needs_agent}
+    launched = started - elsewhere
+    found = [name for name in system.slaves if name not in started]
     private = free_endpoint()
     with ExitStack() as stack:
-        endpoints = _endpoints(system, private, launched=bool(launched), found=bool(found))
+        endpoints = _endpoints(
+            system, private, launched=bool(launched), found=bool(found or elsewhere)
+        )
         bus = ZenohBus(endpoints, timeout=system.bus.discovery_timeout)
         stack.callback(bus.close)
         run = token_hex(4)
         announce_run(bus, run, system)
         launcher = stack.enter_context(
-            Launcher(_connection(endpoints, private), log_directory, pin=system.bus.pin)
+            Launcher(run, _connection(endpoints, private), log_directory, pin=system.bus.pin)
         )
+        agents = stack.enter_context(Agents(bus, run, system, uploading))
+        starters = (launcher, agents)
         keys = {
             name: launcher.launch(name, str(system.slaves[name].model), system.base)
             for name in system.slaves
             if name in launched
         }
+        keys |= {name: agents.start(name) for name in system.slaves if name in elsewhere}
         presence = Presence(bus)
-        keys |= presence.wait(found, keys, launcher, system.bus.discovery_timeout)
+        keys |= presence.wait(found, keys, starters, system.bus.discovery_timeout)
         remotes: dict[str, RemoteSlave] = {}
         stack.callback(_release, remotes)
 
@@ -143,7 +160,8 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
 
         def why_ended(remote: RemoteSlave) -> str:
             died = "its process died" if remote.has_ended else ""
-            return launcher.how_ended(remote.key.name) or died
+            found = (starter.how_ended(remote.key.name) for starter in starters)
+            return next(filter(None, found), died)
 
         recovers = system.simulation.recovery == "auto"
         stack.enter_context(
@@ -155,7 +173,8 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
             )
         )
         restarts = Restarts(system, remotes, claim, launcher, presence, frozenset(launched))
-        slaves = Slaves(dict(remotes), _describe(remotes), launcher, restarts if recovers else None)
+        slaves = Slaves(dict(remotes), _describe(remotes), starters, restarts if recovers else None)
+        agents.verify(slaves.descriptions)
         try:
             yield slaves
         except (KeyboardInterrupt, InterruptedRunError):
@@ -212,14 +231,5 @@ def _endpoints(system: System, private: str, *, launched: bool, found: bool) -> 
 
 def _connection(endpoints: Endpoints, private: str) -> list[str]:
     """The options by which a slave that is started here comes to the same bus."""
-    words = []
-    if endpoints.mode is Mode.CLIENT:
-        words = ["--mode", "client"]
-        words += [word for endpoint in endpoints.connect for word in ("--connect", endpoint)]
-    else:
-        words = ["--connect", private]
-    if endpoints.insecure:
-        words.append("--insecure")
-    if endpoints.credentials is not None:
-        words += ["--tls", str(endpoints.credentials.directory)]
-    return words
+    connect = endpoints.connect if endpoints.mode is Mode.CLIENT else (private,)
+    return connection_options(endpoints.mode, connect, endpoints)

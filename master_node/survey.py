@@ -7,14 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
+from protocol.agents import AgentStatus
 from protocol.bus import Bus, Caller
-from protocol.codec import decode_map
+from protocol.codec import decode_map, decode_record
 from protocol.errors import DeadlineError, DoublestepError, SlaveLostError
 from protocol.keys import (
     STATUS,
+    AgentKey,
     MasterKey,
     RouterKey,
     SlaveKey,
+    alive_agents,
     alive_master,
     alive_routers,
     alive_slaves,
@@ -23,8 +26,8 @@ from protocol.keys import (
 _TOKEN_TIME = 1.0
 _STATUS_TIME = 1.0
 
-Key = SlaveKey | MasterKey | RouterKey
-Status = SlaveStatus | MasterStatus | RouterStatus
+Key = SlaveKey | AgentKey | MasterKey | RouterKey
+Status = SlaveStatus | AgentStatus | MasterStatus | RouterStatus
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class Participant:
 
 
 def survey(buses: Sequence[Bus]) -> list[Participant]:
-    """All slaves, masters and routers in sight, each once, sorted; all are asked at once."""
+    """All slaves, agents, masters and routers in sight, each once, sorted; asked at once."""
     found: dict[Key, Bus] = {}
     for bus in buses:
         for key in _tokens(bus):
@@ -104,6 +107,7 @@ def _tokens(bus: Bus) -> list[Key]:
     keys: list[Key] = []
     for pattern, parse in (
         (alive_slaves(), SlaveKey.from_alive),
+        (alive_agents(), AgentKey.from_alive),
         (alive_master("*"), MasterKey.from_alive),
         (alive_routers(), RouterKey.from_alive),
     ):
@@ -114,6 +118,8 @@ def _tokens(bus: Bus) -> list[Key]:
 def _place(key: Key) -> tuple[str, ...]:
     if isinstance(key, SlaveKey):
         return ("slave", key.name, key.instance)
+    if isinstance(key, AgentKey):
+        return ("agent", key.name, key.instance)
     return ("master", key.run) if isinstance(key, MasterKey) else ("router", key.instance)
 
 
@@ -122,6 +128,8 @@ def _caller(bus: Bus, key: Key) -> Caller:
 
 
 def _status(key: Key, data: bytes) -> Status:
+    if isinstance(key, AgentKey):
+        return decode_record(AgentStatus, data)
     message = decode_map(data)
     if isinstance(key, SlaveKey):
         return SlaveStatus.from_message(message)

@@ -1,7 +1,8 @@
 """What a participant accepts from whom, by the role in the certificate. Zenoh's access control.
 
 Everybody has the same rules, for what comes in. A router passes on what masters and slaves may
-say, so that it is trusted like both. Who has no certificate of a role is not heard at all.
+say, so that it is trusted like both. An agent has the role of the slaves that it starts, or that of
+a router if it listens. Who has no certificate of a role is not heard at all.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ _EVERYTHING: Final = (
 )
 _WATCH: Final = ("declare_liveliness_subscriber", "liveliness_query")
 _SERVE: Final = ("reply", "declare_queryable", "liveliness_token")
-_ALL = "doublestep/**"
+_ALL = ("doublestep/**",)
 
-MAY_SEND: Final[Mapping[Role, Mapping[tuple[str, ...], str]]] = {
+MAY_SEND: Final[Mapping[Role, Mapping[tuple[str, ...], tuple[str, ...]]]] = {
     Role.MASTER: {
         ("query", *_WATCH): _ALL,
-        _SERVE: "doublestep/masters/**",
+        _SERVE: ("doublestep/masters/**",),
     },
     Role.SLAVE: {
         _WATCH: _ALL,
-        _SERVE: "doublestep/slaves/**",
+        _SERVE: ("doublestep/slaves/**", "doublestep/agents/**"),
     },
     Role.ROUTER: {
         ("query", *_SERVE, *_WATCH): _ALL,
@@ -44,7 +45,7 @@ MAY_SEND: Final[Mapping[Role, Mapping[tuple[str, ...], str]]] = {
 
 def access_control() -> dict[str, object]:
     """The ``access_control`` of a Zenoh configuration."""
-    rules = [_rule("send", _EVERYTHING, "egress", "**")]
+    rules = [_rule("send", _EVERYTHING, "egress", ("**",))]
     policies = []
     for role, kinds in MAY_SEND.items():
         names = ["send"]
@@ -61,11 +62,13 @@ def access_control() -> dict[str, object]:
     }
 
 
-def _rule(name: str, messages: tuple[str, ...], flow: str, keys: str) -> dict[str, object]:
+def _rule(
+    name: str, messages: tuple[str, ...], flow: str, keys: tuple[str, ...]
+) -> dict[str, object]:
     return {
         "id": name,
         "messages": list(messages),
         "flows": [flow],
         "permission": "allow",
-        "key_exprs": [keys],
+        "key_exprs": list(keys),
     }

@@ -31,11 +31,27 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from struct import Struct
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import msgpack
 import numpy as np
 
+from protocol.agents import (
+    AgentModel,
+    AgentSlave,
+    AgentStatus,
+    Done,
+    Licence,
+    ModelList,
+    OutputRequest,
+    Record,
+    SlaveOutput,
+    SlaveStarted,
+    StartSlave,
+    StopRun,
+    Upload,
+    UploadState,
+)
 from protocol.calls import (
     CALLS,
     Call,
@@ -723,3 +739,87 @@ def decode_map(data: bytes) -> dict[str, StartValue]:
 def encode_error_map(error: DoublestepError) -> bytes:
     """An error where a flat map was asked for; ``decode_map`` raises it."""
     return encode_map(error.to_reply())
+
+
+# --- records: agents ----------------------------------------------------------------------------
+
+
+def _texts_by_name(value: Any, what: str) -> dict[str, str]:
+    return {name: _text(item, what) for name, item in _mapping(value, what).items()}
+
+
+def _records(cls: Any, checks: Mapping[str, _Check]) -> _Check:
+    """Checks a list of records of one class."""
+
+    def check(value: Any, what: str) -> tuple[Any, ...]:
+        if type(value) is list and len(value) <= MAX_COLUMNS:
+            return tuple(_record(cls, item, checks) for item in value)
+        raise MalformedMessageError(f"{what} must be a list, not {_shown(value)}")
+
+    return check
+
+
+def _exit_code(value: Any, what: str) -> int | None:
+    if value is None or (type(value) is int and -(2**31) <= value < 2**32):
+        return value
+    raise MalformedMessageError(f"{what} must be a 32-bit integer, not {_shown(value)}")
+
+
+_RECORD_FIELDS: Mapping[type, Mapping[str, _Check]] = {
+    AgentStatus: {
+        "name": _text,
+        "instance": _text,
+        "host": _text,
+        "pid": _integer,
+        "labels": _texts_by_name,
+        "licences": _records(Licence, {"name": _text, "total": _integer, "holders": _texts}),
+        "models": _integer,
+        "upload_limit": _integer,
+        "python": _boolean,
+        "slaves": _records(
+            AgentSlave,
+            {"name": _text, "instance": _text, "pid": _integer, "run": _text, "model": _text},
+        ),
+        "since": _number,
+        "time": _number,
+    },
+    ModelList: {"models": _records(AgentModel, {"name": _text, "sha256": _text, "size": _integer})},
+    Upload: {"sha256": _text, "size": _integer, "offset": _integer, "data": _binary},
+    UploadState: {"received": _integer, "complete": _boolean},
+    StartSlave: {
+        "run": _text,
+        "host": _text,
+        "pid": _integer,
+        "orphan_time": _number,
+        "slave": _text,
+        "model": _text,
+        "requires": _texts_by_name,
+    },
+    SlaveStarted: {"instance": _text, "pid": _integer},
+    StopRun: {"run": _text},
+    OutputRequest: {"run": _text, "slave": _text},
+    SlaveOutput: {"exit_code": _exit_code, "lines": _texts, "log": _text},
+    Done: {},
+}
+_R = TypeVar("_R", bound=Record)
+
+
+def encode_record(record: Record) -> bytes:
+    """A record as a map of its fields."""
+    return _pack({"version": PROTOCOL_VERSION, **asdict(record)})
+
+
+def decode_record(cls: type[_R], data: bytes) -> _R:
+    """The record that ``encode_record`` made.
+
+    Raises:
+        VersionError: another protocol version.
+        MalformedMessageError: no such record: a field is missing, unknown or ill-typed.
+        DoublestepError: what the message reports, if it is an error reply; or what the record
+            does not allow.
+    """
+    values = _mapping(_unpack(data, "a message"), "a message")
+    _check_version(values.pop("version", None))
+    if "error" in values:
+        raise DoublestepError.from_reply(values)
+    return _record(cls, values, _RECORD_FIELDS[cls])  # type: ignore[no-any-return]

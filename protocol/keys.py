@@ -8,15 +8,19 @@
     doublestep/masters/<run>/status                 queryable: what a master says of its run
     doublestep/routers/<router>/alive               liveliness token of a router
     doublestep/routers/<router>/status              queryable: what a router says of itself
+    doublestep/agents/<agent>/<instance>/<verb>     queryable: one verb of an agent
+    doublestep/agents/<agent>/<instance>/alive      liveliness token of an agent
 
-``<instance>`` is made anew by each slave process, so that a query can never reach two slaves of
-the same name, nor one that was started again in between.
+``<instance>`` is made anew by each slave or agent process, so that a query can never reach two of
+the same name, nor one that was started again in between. That of a slave which was started for a
+run begins with the id of the run and a dash: it is for that run alone, and nobody finds it by name.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from secrets import token_hex
 
 from protocol.errors import ConfigurationError
 
@@ -25,6 +29,11 @@ CLAIM = "claim"
 RELEASE = "release"
 STATUS = "status"
 ABORT = "abort"
+MODELS = "models"
+UPLOAD = "upload"
+START = "start"
+STOP = "stop"
+OUTPUT = "output"
 _ALIVE = "alive"
 
 _ROOT = "doublestep"
@@ -61,12 +70,52 @@ class SlaveKey:
         """The key of its liveliness token."""
         return self.verb(_ALIVE)
 
+    @property
+    def is_of_run(self) -> bool:
+        """Whether it was started for one run; all others are found by name."""
+        return "-" in self.instance
+
+    @staticmethod
+    def of_run(name: str, run: str) -> SlaveKey:
+        """A new address of a slave that is started for a run."""
+        return SlaveKey(name, f"{run}-{token_hex(4)}")
+
     @staticmethod
     def from_alive(key: str) -> SlaveKey | None:
         """The address in the key of a liveliness token; None when it is none of a slave."""
         parts = key.split("/")
         if len(parts) == 5 and parts[:2] == [_ROOT, "slaves"] and parts[4] == _ALIVE:
             return SlaveKey(parts[2], parts[3])
+        return None
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class AgentKey:
+    """Address of one agent process on the bus."""
+
+    name: str
+    instance: str
+
+    def verb(self, verb: str) -> str:
+        """The key on which this agent serves ``verb``."""
+        return f"{_ROOT}/agents/{self.name}/{self.instance}/{verb}"
+
+    @property
+    def alive(self) -> str:
+        """The key of its liveliness token."""
+        return self.verb(_ALIVE)
+
+    @property
+    def status(self) -> str:
+        """The key on which it tells of itself."""
+        return self.verb(STATUS)
+
+    @staticmethod
+    def from_alive(key: str) -> AgentKey | None:
+        """The address in the key of a liveliness token; None when it is none of an agent."""
+        parts = key.split("/")
+        if len(parts) == 5 and parts[:2] == [_ROOT, "agents"] and parts[4] == _ALIVE:
+            return AgentKey(parts[2], parts[3])
         return None
 
 
@@ -123,6 +172,11 @@ class RouterKey:
 def alive_routers() -> str:
     """Matches the liveliness tokens of all routers."""
     return f"{_ROOT}/routers/*/{_ALIVE}"
+
+
+def alive_agents(name: str = "*") -> str:
+    """Matches the liveliness tokens of all agents, or of all those called ``name``."""
+    return f"{_ROOT}/agents/{name}/*/{_ALIVE}"
 
 
 def alive_slaves(name: str = "*") -> str:

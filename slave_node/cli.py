@@ -7,10 +7,13 @@ import logging
 import math
 import os
 import signal
+import socket
 import sys
+import tempfile
 import threading
 import tomllib
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from secrets import token_hex
@@ -23,7 +26,7 @@ from protocol.bus import DEFAULT_ENDPOINT
 from protocol.credentials import Credentials, Role
 from protocol.endpoints import Endpoints, Mode
 from protocol.errors import ConfigurationError, DoublestepError
-from protocol.keys import RouterKey, SlaveKey, check_name
+from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
 from protocol.slave import StartValue
 
 app = typer.Typer(
@@ -34,6 +37,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 log = logging.getLogger("slave_node")
+
+_MB = 10**6
 
 Model = Annotated[
     str, typer.Argument(help="An .fmu file, package.module:Class or path/to/file.py:Class.")
@@ -220,6 +225,110 @@ def check(
 
 
 @app.command()
+def agent(  # noqa: PLR0917  options of the command line
+    models: Annotated[
+        Path, typer.Option(metavar="DIR", help="Models that masters may start, without subfolders.")
+    ],
+    name: Annotated[
+        str, typer.Option(help="Name on the bus, as `host` in system files [default: the host's].")
+    ] = "",
+    label: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="What this host has; may be repeated."),
+    ] = None,
+    licence: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=COUNT", help="How many slaves may hold a licence; may be repeated."
+        ),
+    ] = None,
+    allow_upload: Annotated[
+        bool, typer.Option("--allow-upload", help="Load FMUs that masters send.")
+    ] = False,
+    upload_limit: Annotated[
+        int, typer.Option(metavar="MB", min=1, help="Largest FMU that masters may send.")
+    ] = 500,
+    cache: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Keeps what was sent [default: in the user's cache]."),
+    ] = None,
+    cache_limit: Annotated[
+        int, typer.Option(metavar="MB", min=1, help="How much is kept of what was sent.")
+    ] = 5000,
+    allow_python: Annotated[
+        bool, typer.Option("--allow-python", help="Start Python models that masters name.")
+    ] = False,
+    logs: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Keep what the slaves say [default: until they end]."),
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Master or router to connect to [default: {DEFAULT_ENDPOINT}]."),
+    ] = None,
+    listen: Annotated[
+        list[str] | None, typer.Option(help="Address on which masters reach agent and slaves.")
+    ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
+    ] = False,
+    tls: Tls = None,
+    mode: Annotated[
+        Mode, typer.Option(help="peer: reach masters directly; client: through a router.")
+    ] = Mode.PEER,
+) -> None:
+    """Start slaves on this host when masters ask for them, until SIGTERM or Ctrl-C."""
+    from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  each command imports what it needs
+    from slave_node.agent import Agent, Offer, Surroundings  # noqa: PLC0415
+    from slave_node.agent_options import (  # noqa: PLC0415
+        default_cache,
+        parse_labels,
+        parse_licences,
+        places_of,
+    )
+    from slave_node.model_store import ModelStore  # noqa: PLC0415
+    from slave_node.upload_cache import UploadCache  # noqa: PLC0415
+
+    key = AgentKey(check_name(name or socket.gethostname(), "agent name"), token_hex(4))
+    logging.basicConfig(
+        level=logging.INFO, stream=sys.stderr, format=f"%(asctime)s agent {key.name}: %(message)s"
+    )
+    if logs is not None:
+        _make_directory(logs)
+    places = places_of(connect or (), listen or (), mode, insecure=insecure, tls=tls)
+    offer = Offer(
+        labels=parse_labels(label or ()),
+        licences=parse_licences(licence or ()),
+        store=ModelStore(models, python=allow_python),
+        cache=UploadCache(cache or default_cache(key.name), upload_limit * _MB, cache_limit * _MB)
+        if allow_upload
+        else None,
+        python=allow_python,
+    )
+    ending = threading.Event()
+
+    def end(reason: str) -> None:
+        log.info("ending: %s", reason)
+        ending.set()
+
+    _end_on_signals(end)
+    with ExitStack() as stack:
+        scratch = stack.enter_context(
+            tempfile.TemporaryDirectory(prefix="doublestep-", ignore_cleanup_errors=True)
+        )
+        try:
+            bus = ZenohBus(places.own, stop=ending)
+            stack.callback(bus.close)
+            log.info("on the bus %s", _where(places.own))
+            surroundings = Surroundings(places.of_slaves, Path(scratch), logs)
+            Agent(bus, key, offer, surroundings).serve(ending)
+        except DoublestepError:
+            if not ending.is_set():  # else it is what the ending did to what was under way
+                raise
+    log.info("ended")
+
+
+@app.command()
 def certificates(
     directory: Annotated[
         Path, typer.Argument(metavar="DIR", help="Where the authority is, or will be.")
@@ -300,6 +409,13 @@ def _where(endpoints: Endpoints) -> str:
     return ", ".join(places)
 
 
+def _make_directory(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be made: {error}") from error
+
+
 def _default_name(model: str) -> str:
     return model.rpartition(":")[2] if ":" in model else Path(model).stem
 
@@ -349,7 +465,7 @@ def _end_with_parent(end: Callable[[str], None]) -> None:
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 4096):
             pass
-        end("the master that started this slave is done or gone")
+        end("who started this slave is done or gone")
 
     threading.Thread(target=watch, name="parent", daemon=True).start()
 

@@ -95,7 +95,7 @@ class SlaveNode:
         Raises:
             ConfigurationError: a slave of this name is on the bus already.
         """
-        others = self._bus.alive(alive_slaves(self._key.name), _PEER_TIME)
+        others = [] if self._key.is_of_run else self._others()
         if others:
             raise ConfigurationError(
                 f"a slave named {self._key.name!r} is on the bus already: {', '.join(others)}",
@@ -110,6 +110,11 @@ class SlaveNode:
             self._bus.serve(key.verb(call.verb), self._single(call))
         self._bus.watch(alive_master("*"), self._master_changed)
         self._bus.serve_here(key.verb(EXECUTE), self._execute, self._announce)
+
+    def _others(self) -> list[str]:
+        """The tokens of slaves that are found by the same name."""
+        tokens = self._bus.alive(alive_slaves(self._key.name), _PEER_TIME)
+        return [t for t in tokens if not ((key := SlaveKey.from_alive(t)) and key.is_of_run)]
 
     @property
     def busy(self) -> bool:

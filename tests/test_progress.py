@@ -12,8 +12,9 @@ import pytest
 from rich.console import Console
 
 from master_node import progress as progress_module
+from master_node.agents import Sent
 from master_node.observers import Attempt, Outcome, RunEnd, RunStart, SlaveStatistics, Statistics
-from master_node.progress import ProgressBar, summary_table
+from master_node.progress import ProgressBar, UploadBar, summary_table
 from master_node.results import summarize
 
 START = RunStart(("s.x",), ("m",), 1.0, 5.0, np.zeros(1))
@@ -146,3 +147,23 @@ def test_summary_table_leaves_out_what_is_not_known() -> None:
     assert "s: lost" in text
     assert "step size" not in text
     assert printed({}).strip() == ""
+
+
+def test_a_model_on_its_way_is_seen_at_a_terminal_only() -> None:
+    """Model, agent and bytes, whatever is in the names; and the cursor is back after a failure."""
+    seen = {}
+    for terminal in (True, False):
+        out = io.StringIO()
+        console = Console(file=out, force_terminal=terminal, width=120)
+        with pytest.raises(OSError, match="lost"), UploadBar(console=console) as bar:  # noqa: PT012
+            bar(Sent("wheel", "winbox", "[b]wheel.fmu", 1_000_000, 3_000_000))
+            raise OSError("lost")
+        seen[terminal] = out.getvalue()
+    assert seen[False] == ""
+    assert "[b]wheel.fmu to winbox" in seen[True]
+    assert "1.0/3.0 MB" in seen[True]
+    assert seen[True].rindex("\x1b[?25h") > seen[True].index("\x1b[?25l")
+    out = io.StringIO()
+    with UploadBar(quiet=True, console=Console(file=out, force_terminal=True)) as bar:
+        bar(Sent("wheel", "winbox", "wheel.fmu", 1, 1))
+    assert out.getvalue() == ""

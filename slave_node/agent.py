@@ -1,0 +1,435 @@
+"""The agent: starts slaves on this host for masters, and tells what became of them.
+
+It chooses what may be loaded: files of a directory, named by the master without any path, and
+models that were sent if that is allowed. Knows no transport: it takes a `Bus`.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from shutil import rmtree
+from typing import TypeVar
+
+from protocol.agents import (
+    LICENCE,
+    AgentSlave,
+    AgentStatus,
+    Done,
+    Licence,
+    ModelList,
+    OutputRequest,
+    Record,
+    SlaveOutput,
+    SlaveStarted,
+    StartSlave,
+    StopRun,
+    Upload,
+    UploadState,
+    is_sha256,
+)
+from protocol.bus import Bus
+from protocol.codec import decode_record, encode_error_map, encode_record
+from protocol.errors import (
+    ConfigurationError,
+    DoublestepError,
+    ModelError,
+    SlaveBusyError,
+    SlaveLostError,
+)
+from protocol.keys import (
+    MODELS,
+    OUTPUT,
+    START,
+    STOP,
+    UPLOAD,
+    AgentKey,
+    MasterKey,
+    SlaveKey,
+    alive_agents,
+    alive_master,
+)
+from protocol.processes import has_ended
+from protocol.slave_processes import SlaveProcess, end_all
+from slave_node.model_store import ModelStore
+from slave_node.upload_cache import UploadCache
+
+log = logging.getLogger("slave_node")
+
+_PEER_TIME = 1.0
+_MAX_SLAVES = 256
+_INSTALLED_MODEL = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*")
+_CLASS = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class Offer:
+    """What an agent has for masters.
+
+    Attributes:
+        labels: what it says of its host.
+        licences: how many slaves may hold each of them at once.
+        store: models that are there.
+        cache: for models that masters send; None: they may not.
+        python: start Python models.
+    """
+
+    labels: Mapping[str, str]
+    licences: Mapping[str, int]
+    store: ModelStore
+    cache: UploadCache | None = None
+    python: bool = False
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Where the slaves of an agent live.
+
+    Attributes:
+        connection: options of ``slave-node serve`` that lead them to the bus.
+        scratch: existing directory for temporary files.
+        logs: existing directory for what they say; None: kept only until their run has ended.
+    """
+
+    connection: Sequence[str]
+    scratch: Path
+    logs: Path | None = None
+
+
+@dataclass
+class _Run:
+    """What was started for a run."""
+
+    request: StartSlave
+    slaves: dict[str, tuple[StartSlave, SlaveProcess]] = field(default_factory=dict)
+    changes: int = 0
+    ending: bool = False
+
+
+_R = TypeVar("_R", bound=Record)
+
+
+class Agent:
+    """One agent on the bus.
+
+    Args:
+        bus: opened; the caller closes it.
+        key: name and instance.
+        offer: what it has.
+        surroundings: where the slaves live.
+    """
+
+    def __init__(self, bus: Bus, key: AgentKey, offer: Offer, surroundings: Surroundings) -> None:
+        self._bus = bus
+        self._key = key
+        self._offer = offer
+        self._surroundings = surroundings
+        self._runs: dict[str, _Run] = {}
+        self._lock = threading.RLock()
+        self._closed = False
+        self._since = time.time()
+
+    def serve(self, ending: threading.Event) -> None:
+        """Serve until ``ending`` is set; then all slaves are ended.
+
+        Raises:
+            ConfigurationError: an agent of this name is on the bus already, or the models cannot
+                be read.
+        """
+        others = self._bus.alive(alive_agents(self._key.name), _PEER_TIME)
+        if others:
+            raise ConfigurationError(
+                f"an agent named {self._key.name!r} is on the bus already: {', '.join(others)}",
+                remedy="end it, or give this one another --name",
+            )
+        models = self._offer.store.models()
+        self._bus.serve(self._key.status, lambda _: encode_record(self.status()))
+        self._bus.serve(self._key.verb(MODELS), self._answer_models)
+        self._serve(UPLOAD, Upload, self.upload)
+        self._serve(START, StartSlave, self.start)
+        self._serve(STOP, StopRun, self.stop)
+        self._serve(OUTPUT, OutputRequest, self.output)
+        self._bus.watch(alive_master("*"), self._master_changed)
+        self._bus.announce(self._key.alive)
+        log.info("ready: agent with %d models, instance %s", len(models), self._key.instance)
+        try:
+            ending.wait()
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """End all slaves and start no more."""
+        with self._lock:
+            self._closed = True
+            processes = [p for run in self._runs.values() for _, p in run.slaves.values()]
+        end_all(processes)
+        if self._offer.cache is not None:
+            self._offer.cache.close()
+
+    def _serve(self, verb: str, cls: type[_R], handle: Callable[[_R], Record]) -> None:
+        def answer(data: bytes) -> bytes:
+            try:
+                return encode_record(handle(decode_record(cls, data)))
+            except DoublestepError as error:
+                log.warning("%s refused: %s", verb, error)
+                return encode_error_map(error)
+
+        self._bus.serve(self._key.verb(verb), answer)
+
+    def _answer_models(self, _: bytes) -> bytes:
+        try:
+            return encode_record(self.models())
+        except DoublestepError as error:
+            return encode_error_map(error)
+
+    def status(self) -> AgentStatus:
+        """What it says of itself."""
+        offer = self._offer
+        with self._lock:
+            running = self._running()
+            licences = self._licences()
+        try:
+            count = offer.store.count() + (len(offer.cache.models()) if offer.cache else 0)
+        except ConfigurationError as error:
+            log.warning("%s", error)
+            count = 0
+        return AgentStatus(
+            name=self._key.name,
+            instance=self._key.instance,
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            labels=offer.labels,
+            licences=licences,
+            models=count,
+            upload_limit=0 if offer.cache is None else offer.cache.largest,
+            python=offer.python,
+            slaves=tuple(
+                AgentSlave(p.key.name, p.key.instance, p.pid, r.run, r.model) for r, p in running
+            ),
+            since=self._since,
+            time=time.time(),
+        )
+
+    def models(self) -> ModelList:
+        """All that can be started by hash or name; raises as `ModelStore.models`."""
+        cache = self._offer.cache
+        uploaded = () if cache is None else cache.models()
+        return ModelList((*self._offer.store.models(), *uploaded))
+
+    def upload(self, piece: Upload) -> UploadState:
+        """Take a piece of a model.
+
+        Raises:
+            ConfigurationError: this agent takes no models, or as `UploadCache.receive`.
+            ProtocolError, ModelError: as `UploadCache.receive`.
+        """
+        cache = self._offer.cache
+        if cache is None:
+            raise ConfigurationError(
+                "models may not be sent",
+                remedy="copy the model into its --models directory, or start the agent with "
+                "--allow-upload",
+            )
+        with self._lock:
+            in_use = {r.model for r, _ in self._running() if is_sha256(r.model)}
+        return cache.receive(piece, in_use)
+
+    def start(self, request: StartSlave) -> SlaveStarted:
+        """Start a slave; the same request again gets the same answer.
+
+        Raises:
+            ConfigurationError: a label is missing, or the process cannot be started.
+            ModelError: there is no such model, or it may not be started.
+            SlaveBusyError: the licence is taken; or the run has a slave of this name.
+        """
+        with self._lock:
+            run = self._runs.get(request.run)
+            started = run.slaves.get(request.slave) if run else None
+            if started is not None and started[0] == request:
+                return SlaveStarted(started[1].key.instance, started[1].pid)
+            if started is not None or (run is not None and run.ending):
+                raise SlaveBusyError(f"run {request.run} has ended, or has another such slave")
+            self._check(request)
+            base, model = self._model(request.model)
+            process = self._process(model, base, request.slave, request.run)
+            self._runs.setdefault(request.run, _Run(request)).slaves[request.slave] = (
+                request,
+                process,
+            )
+        log.info("started %s with %s for run %s", request.slave, request.model, request.run)
+        self._look_after(request.run, request.orphan_time)  # its master may be gone already
+        return SlaveStarted(process.key.instance, process.pid)
+
+    def stop(self, request: StopRun) -> Done:
+        """End all slaves of a run, in a bounded time."""
+        self._end(request.run)
+        return Done()
+
+    def output(self, request: OutputRequest) -> SlaveOutput:
+        """What became of a slave.
+
+        Raises:
+            SlaveLostError: no such slave was started, or its run has ended.
+        """
+        with self._lock:
+            run = self._runs.get(request.run)
+            started = run.slaves.get(request.slave) if run else None
+        if started is None:
+            raise SlaveLostError(f"run {request.run} has no slave {request.slave!r} here")
+        process = started[1]
+        kept = "" if self._surroundings.logs is None else str(process.log)
+        return SlaveOutput(process.exit_code, process.last_lines(), kept)
+
+    def _check(self, request: StartSlave) -> None:
+        """Whether there is what it asks for, now."""
+        if self._closed:
+            raise SlaveLostError("the agent is ending")
+        offer = self._offer
+        for name, value in request.requires.items():
+            counted = name == LICENCE and value in offer.licences
+            if not counted and offer.labels.get(name) != value:
+                raise ConfigurationError(
+                    f"it has no {name} = {value}",
+                    remedy=f"start the agent with --label {name}={value}",
+                )
+        wanted = request.requires.get(LICENCE)
+        for licence in self._licences():
+            if licence.name == wanted and not licence.free:
+                raise SlaveBusyError(
+                    f"all {licence.total} licences {licence.name} are taken: "
+                    + ", ".join(licence.holders),
+                    remedy="wait for these to end",
+                )
+        if sum(len(run.slaves) for run in self._runs.values()) >= _MAX_SLAVES:
+            raise SlaveBusyError(f"it has {_MAX_SLAVES} slaves already")
+
+    def _running(self) -> list[tuple[StartSlave, SlaveProcess]]:
+        return [
+            started
+            for run in self._runs.values()
+            for started in run.slaves.values()
+            if started[1].exit_code is None
+        ]
+
+    def _licences(self) -> tuple[Licence, ...]:
+        """A process that has ended holds nothing any more."""
+        holders: dict[str, list[str]] = {name: [] for name in self._offer.licences}
+        for request, _ in self._running():
+            wanted = request.requires.get(LICENCE, "")
+            if wanted in holders:
+                holders[wanted].append(
+                    f"{request.slave} of run {request.run} on {request.host} (pid {request.pid})"
+                )
+        return tuple(
+            Licence(name, total, tuple(holders[name]))
+            for name, total in self._offer.licences.items()
+        )
+
+    def _model(self, model: str) -> tuple[Path, str]:
+        """Directory and name of a model that may be started."""
+        if ":" in model:
+            return self._python_model(model)
+        store, cache = self._offer.store, self._offer.cache
+        if is_sha256(model):
+            name = store.name_of(model)
+            if name is not None:
+                return store.directory, name
+            path = None if cache is None else cache.path(model)
+            if path is not None:
+                return path.parent, path.name
+        elif model.lower().endswith(".fmu") and store.has(model):
+            return store.directory, model
+        raise ModelError(
+            f"it has no model {model!r:.140}", remedy="copy it into its --models directory"
+        )
+
+    def _python_model(self, model: str) -> tuple[Path, str]:
+        if not self._offer.python:
+            raise ModelError(
+                f"it starts no Python models, such as {model!r:.140}",
+                remedy="start the agent with --allow-python, or export the model as an FMU",
+            )
+        place, _, name = model.rpartition(":")
+        is_file = place.endswith(".py") and self._offer.store.has(place)
+        is_installed = not place.endswith(".py") and _INSTALLED_MODEL.fullmatch(place)
+        if not (_CLASS.fullmatch(name) and (is_file or is_installed)):
+            raise ModelError(
+                f"it has no Python model {model!r:.140}",
+                remedy="name package.module:Class, or file.py:Class of a file in its --models "
+                "directory",
+            )
+        return self._offer.store.directory, model
+
+    def _process(self, model: str, base: Path, slave: str, run: str) -> SlaveProcess:
+        places = self._surroundings
+        key = SlaveKey.of_run(slave, run)
+        scratch = places.scratch / key.instance
+        log_file = (places.logs or places.scratch) / f"{slave}.{key.instance}.log"
+        try:
+            scratch.mkdir()
+        except OSError as error:
+            raise ConfigurationError(f"{scratch} cannot be made: {error}") from error
+        return SlaveProcess(
+            model, base, key, connection=places.connection, log=log_file, scratch=scratch
+        )
+
+    def _master_changed(self, key: str, alive: bool) -> None:
+        master = MasterKey.from_alive(key)
+        if master is None:
+            return
+        with self._lock:
+            run = self._runs.get(master.run)
+            if run is None:
+                return
+            run.changes += 1
+            request = run.request
+        if alive:
+            return
+        log.warning("the master of run %s is gone", master.run)
+        ended = has_ended(request.host, request.pid)
+        self._look_after(master.run, 0.0 if ended else request.orphan_time)
+
+    def _look_after(self, run: str, wait: float) -> None:
+        """See after ``wait`` seconds whether the master of ``run`` is there."""
+        with self._lock:
+            known = self._runs.get(run)
+            changes = 0 if known is None else known.changes
+        timer = threading.Timer(wait, self._end_orphans, (run, changes))
+        timer.daemon = True
+        timer.start()
+
+    def _end_orphans(self, run: str, changes: int) -> None:
+        with self._lock:
+            known = self._runs.get(run)
+        if known is None or known.changes != changes:
+            return  # it came meanwhile; if it went again, that is waited for anew
+        try:
+            if self._bus.alive(alive_master(run), _PEER_TIME):
+                return
+        except SlaveLostError:  # the bus is closed: the agent is ending
+            return
+        log.warning("run %s has no master any more: ending its slaves", run)
+        self._end(run)
+
+    def _end(self, run: str) -> None:
+        with self._lock:
+            known = self._runs.get(run)
+            if known is None:
+                return
+            known.ending = True
+        processes = [process for _, process in known.slaves.values()]
+        end_all(processes)
+        with self._lock:
+            self._runs.pop(run, None)
+        for process in processes:
+            log.info("ended %s of run %s", process.key.name, run)
+            if self._surroundings.logs is None:
+                process.log.unlink(missing_ok=True)
+            rmtree(self._surroundings.scratch / process.key.instance, ignore_errors=True)
