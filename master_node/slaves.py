@@ -143,6 +143,8 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
 
         def why_ended(remote: RemoteSlave) -> str:
             died = "its process died" if remote.has_ended else ""
+            if died:
+                launcher.wait_ended(remote.key.name, _DEATH_TIME)
             return launcher.how_ended(remote.key.name) or died
 
         recovers = system.simulation.recovery == "auto"
