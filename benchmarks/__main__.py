@@ -8,6 +8,7 @@ from benchmarks import (
     many_variables,
     memory,
     over_zenoh,
+    recovery,
     saved_states,
     tls,
 )
@@ -42,6 +43,11 @@ TABLES = {
         "Attempted double step of two slaves with many connected variables",
         ("configuration", "5 000 variables", "10 variables", "ratio"),
         many_variables.run,
+    ),
+    "recovery": (
+        "A slave process is killed in mid step",
+        ("process", "noticed after", "the next double step is done after"),
+        recovery.run,
     ),
     "memory": (
         "Resident memory over a million attempted double steps",

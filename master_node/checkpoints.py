@@ -172,6 +172,7 @@ class Checkpoints:
         """
         saved = resumed.checkpoint.slaves
         for slave in self._slaves:
+            slave.restarts = resumed.statistics.slaves[slave.name].restarts
             state, first, log = saved[slave.name]
             slave.resume(state, first, list(log.steps(first)))
 
@@ -186,6 +187,10 @@ class Checkpoints:
         self._saved_time = self._earliest = self._written = monotonic()
         if self._store is not None:
             self._store.begin()
+
+    def restarts(self) -> dict[str, int]:
+        """How often each slave was started again."""
+        return {slave.name: slave.restarts for slave in self._slaves}
 
     def settle(self) -> None:
         """All slaves stand at a communication point from which the run does not go back.

@@ -187,6 +187,8 @@ class CoSimulation:
             statistics.wall_time = perf_counter() - begin
             statistics.round_trips = self.group.round_trips
             statistics.wait_time = self.group.wait_time
+            for slave, restarts in self.checkpoints.restarts().items():
+                statistics.slaves[slave].restarts = restarts
 
         outcome, message = Outcome.FAILED, ""
         try:

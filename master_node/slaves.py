@@ -160,6 +160,8 @@ def slaves_on_bus(
 
         def why_ended(remote: RemoteSlave) -> str:
             died = "its process died" if remote.has_ended else ""
+            if died:
+                launcher.wait_ended(remote.key.name, _DEATH_TIME)
             found = (starter.how_ended(remote.key.name) for starter in starters)
             return next(filter(None, found), died)
 
