@@ -1,8 +1,8 @@
-"""Prints the tables, as Markdown."""
+"""Prints the tables, as Markdown. What takes options is run by name only: see `CHECKS`."""
 
 import sys
 
-from benchmarks import in_process, memory, over_zenoh
+from benchmarks import fuzz, in_process, memory, over_zenoh
 
 TABLES = {
     "over_zenoh": (
@@ -22,9 +22,15 @@ TABLES = {
     ),
 }
 
+CHECKS = {"fuzz": fuzz.main}
+"""With their own options; they end with an error when something did not hold."""
+
 
 def main(names: list[str]) -> None:
-    """Run the named benchmarks, or all."""
+    """Run the named benchmarks, or all tables."""
+    if names and names[0] in CHECKS:
+        CHECKS[names[0]](names[1:])
+        return
     for name in names or TABLES:
         title, columns, run = TABLES[name]
         print(f"\n### {title}\n")
