@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import fuzz, in_process, memory, over_zenoh
+from benchmarks import fault_schedules, fuzz, in_process, memory, over_zenoh
 
 TABLES = {
     "over_zenoh": (
@@ -22,7 +22,7 @@ TABLES = {
     ),
 }
 
-CHECKS = {"fuzz": fuzz.main}
+CHECKS = {"fuzz": fuzz.main, "fault_schedules": fault_schedules.main}
 """With their own options; they end with an error when something did not hold."""
 
 

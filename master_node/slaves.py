@@ -6,14 +6,12 @@ Each way is a context manager that gives a `Slaves` and leaves nothing running b
 from __future__ import annotations
 
 import tempfile
-import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from secrets import token_hex
-from time import monotonic
 
 from master_node.configuration import System
 from master_node.launcher import Launcher
@@ -21,6 +19,7 @@ from master_node.remote_slave import RemoteSlave, slave_status
 from master_node.slave_link import LocalSlave, SlaveLink
 from protocol.bus import DEFAULT_ENDPOINT, Bus
 from protocol.calls import Describe
+from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.errors import (
     ConfigurationError,
     DeadlineError,
@@ -120,39 +119,70 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
             for name in system.slaves
             if name in launched
         }
-        presence = _Presence(bus)
+        presence = Presence(bus)
         keys |= presence.wait(found, keys, launcher, system.bus.discovery_timeout)
-        links: dict[str, SlaveLink] = {}
-        remotes = {}
-        for name in system.slaves:
-            try:
-                remote = RemoteSlave(bus, keys[name], run, system.bus.step_timeout)
-            except DoublestepError as error:
-                raise error.located(slave=name, phase="claim") from None
-            links[name] = remotes[keys[name].alive] = remote
-            stack.callback(remote.release)
-        presence.on_loss(remotes)
-        stack.callback(presence.on_loss, {})
-        slaves = Slaves(links, _describe(links), launcher)
+        keys = {name: keys[name] for name in system.slaves}
+        remotes = stack.enter_context(
+            claimed_slaves(bus, presence, keys, run=run, step_timeout=system.bus.step_timeout)
+        )
+        slaves = Slaves(remotes, describe(remotes), launcher)
         try:
             yield slaves
         except (KeyboardInterrupt, InterruptedRunError):
             launcher.stop(at_once=True)
             raise
         except DoublestepError as error:
-            if isinstance(error, DeadlineError) and error.slave in keys:
-                remotes[keys[error.slave].alive].abort()
+            if isinstance(error, DeadlineError) and error.slave in remotes:
+                remotes[error.slave].abort()
             raise slaves.explain(error) from error.__cause__
 
 
-def _describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
+@contextmanager
+def claimed_slaves(
+    bus: Bus,
+    presence: Presence,
+    keys: Mapping[str, SlaveKey],
+    *,
+    run: str,
+    step_timeout: float,
+) -> Iterator[dict[str, RemoteSlave]]:
+    """Claim slaves for a run, be told when one vanishes, and give them back at the end.
+
+    Args:
+        bus: on which they are.
+        presence: follows their tokens.
+        keys: their addresses by name, in the order in which they are claimed.
+        run: id of the run.
+        step_timeout: bound on one request [s].
+
+    Raises:
+        SlaveBusyError, SlaveLostError, DeadlineError: one cannot be claimed; names it.
+    """
+    with ExitStack() as stack:
+        remotes: dict[str, RemoteSlave] = {}
+        for name, key in keys.items():
+            try:
+                remotes[name] = RemoteSlave(bus, key, run, step_timeout)
+            except DoublestepError as error:
+                raise error.located(slave=name, phase="claim") from None
+            stack.callback(remotes[name].release)
+        presence.on_loss({remote.key.alive: remote for remote in remotes.values()})
+        stack.callback(presence.on_loss, {})
+        yield remotes
+
+
+def describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
+    """What each slave says of itself; raises what it answers instead, with its name."""
     for link in links.values():
         link.start([Describe()])
     descriptions = {}
     for name, link in links.items():
-        reply = link.finish()
-        if reply.error is not None:
-            raise reply.error.located(slave=name)
+        try:
+            reply = link.finish()
+            if reply.error is not None:
+                raise reply.error
+        except DoublestepError as error:
+            raise error.located(slave=name, phase=Describe.verb) from error.__cause__
         description = reply.results[0]
         assert isinstance(description, SlaveDescription)
         descriptions[name] = description
@@ -173,12 +203,18 @@ def _endpoints(system: System, private: str, *, launched: bool, found: bool) -> 
         ) from None
 
 
-class _Presence:
-    """Which slaves are on the bus, as their liveliness tokens come and go."""
+class Presence:
+    """Which slaves are on the bus, as their liveliness tokens come and go.
 
-    def __init__(self, bus: Bus) -> None:
+    Args:
+        bus: opened.
+        clock: for its waits.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock = SYSTEM_CLOCK) -> None:
         self._bus = bus
-        self._changed = threading.Condition()
+        self._clock = clock
+        self._changed = clock.condition()
         self._alive: set[SlaveKey] = set()
         self._remotes: Mapping[str, RemoteSlave] = {}
         bus.watch(alive_slaves(), self._told)
@@ -204,9 +240,7 @@ class _Presence:
 
     def _lost(self, remote: RemoteSlave) -> None:
         remote.lost()
-        timer = threading.Timer(_RETURN_TIME, self._abandon, (remote.key,))
-        timer.daemon = True
-        timer.start()
+        self._clock.later(_RETURN_TIME, lambda: self._abandon(remote.key))
 
     def _abandon(self, gone: SlaveKey) -> None:
         """A slave that stays away ends the run, however long the steps of the others take."""
@@ -223,20 +257,26 @@ class _Presence:
         Returns:
             The keys of the slaves called ``names``.
         """
-        deadline = monotonic() + timeout
+        deadline = self._clock.monotonic() + timeout
         while True:
             launcher.check()
             with self._changed:
                 alive = set(self._alive)
-                missing = [n for n in names if not any(k.name == n for k in alive)]
-                missing += [name for name, key in keys.items() if key not in alive]
-                if not missing:
-                    break
-                if monotonic() > deadline:
-                    raise self._not_found(missing, alive, timeout)
+            missing = [n for n in names if not any(k.name == n for k in alive)]
+            missing += [name for name, key in keys.items() if key not in alive]
+            found = {} if missing else self._only_instances((*names, *keys))
+            missing = missing or [name for name in names if name not in found]
+            if not missing:
+                return {name: found[name] for name in names}
+            if self._clock.monotonic() > deadline:
+                raise self._not_found(missing, alive, timeout)
+            with self._changed:
                 self._changed.wait(_POLL_TIME)
+
+    def _only_instances(self, names: Sequence[str]) -> dict[str, SlaveKey]:
+        """Asked for now: the one slave of each name; none of one that has just gone again."""
         found = {}
-        for name in (*names, *keys):
+        for name in names:
             tokens = self._bus.alive(alive_slaves(name), _LIVELINESS_TIME)
             instances = [k for k in map(SlaveKey.from_alive, tokens) if k is not None]
             if len(instances) > 1:
@@ -246,7 +286,7 @@ class _Presence:
                     slave=name,
                     remedy="end all but one of them",
                 )
-            if name in names:
+            if instances:
                 found[name] = instances[0]
         return found
 

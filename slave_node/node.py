@@ -9,12 +9,12 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import threading
 from collections.abc import Callable, Mapping
 from datetime import datetime
 
 from protocol.bus import Bus
 from protocol.calls import CALLS, Call, Reply, Reset
+from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.codec import (
     PROTOCOL_VERSION,
     decode_map,
@@ -65,6 +65,7 @@ class SlaveNode:
         key: name and instance.
         description: of the slave that ``worker`` holds.
         orphan_time: a slave whose master vanished without release resets itself after this [s].
+        clock: for its waits and locks.
     """
 
     def __init__(
@@ -74,6 +75,8 @@ class SlaveNode:
         key: SlaveKey,
         description: SlaveDescription,
         orphan_time: float = 5.0,
+        *,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._bus = bus
         self._worker = worker
@@ -81,7 +84,8 @@ class SlaveNode:
         self._description = description
         self._orphan_time = orphan_time
         self._claims = Claims()
-        self._running = threading.Lock()
+        self._clock = clock
+        self._running = clock.lock()
         self._worker_alive = True
         self._since = _now()
 
@@ -250,9 +254,7 @@ class SlaveNode:
 
     def _look_after(self, epoch: int, wait: float) -> None:
         """See after ``wait`` seconds whether the master of ``epoch`` is there."""
-        timer = threading.Timer(wait, self._reset_orphan, (epoch,))
-        timer.daemon = True
-        timer.start()
+        self._clock.later(wait, lambda: self._reset_orphan(epoch))
 
     def _reset_orphan(self, epoch: int) -> None:
         """Give a slave back whose master is gone; a step under way is for nobody any more."""
