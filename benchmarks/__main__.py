@@ -2,7 +2,16 @@
 
 import sys
 
-from benchmarks import fault_schedules, fuzz, in_process, memory, over_zenoh
+from benchmarks import (
+    emulated_inputs,
+    fault_schedules,
+    fuzz,
+    in_process,
+    memory,
+    over_zenoh,
+    saved_states,
+    tls,
+)
 
 TABLES = {
     "over_zenoh": (
@@ -14,6 +23,21 @@ TABLES = {
         "Attempted double step in process",
         ("configuration", "attempted double step", "by hand with FMPy", "ratio"),
         in_process.run,
+    ),
+    "tls": (
+        "Attempted double step over TLS, two slave processes on loopback",
+        ("configuration", "over TLS", "over TCP", "ratio"),
+        tls.run,
+    ),
+    "emulated_inputs": (
+        "Inputs followed natively / emulated / held, quarter car",
+        ("configuration", "accepted steps", "mean error", "slaves' time for a do_step"),
+        emulated_inputs.run,
+    ),
+    "saved_states": (
+        "States saved by forking and natively",
+        ("what", "fork", "native", "ratio"),
+        saved_states.run,
     ),
     "memory": (
         "Resident memory over a million attempted double steps",

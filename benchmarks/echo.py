@@ -3,7 +3,8 @@
 import signal
 import sys
 
-from protocol.zenoh_bus import Endpoints, ZenohBus
+from protocol.endpoints import Endpoints
+from protocol.zenoh_bus import ZenohBus
 
 
 def main(endpoint: str, key: str) -> None:

@@ -13,7 +13,8 @@ from master_node.co_simulation import CoSimulation
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import slaves_on_bus
 from master_node.system import resolve
-from protocol.zenoh_bus import Endpoints, ZenohBus, free_endpoint
+from protocol.endpoints import Endpoints, free_endpoint
+from protocol.zenoh_bus import ZenohBus
 
 
 def run() -> list[tuple[str, str, str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import signal
 import sys
@@ -12,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from protocol.credentials import Credentials, Role
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
 
 app = typer.Typer(
@@ -24,6 +26,18 @@ app = typer.Typer(
 
 log = logging.getLogger("master_node")
 
+Tls = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Certificates: encrypt, and let in only who has one."),
+]
+Connect = Annotated[
+    list[str] | None,
+    typer.Option(help="Router, or slave or master that listens, tcp/HOST:PORT; may be repeated."),
+]
+Listen = Annotated[
+    list[str] | None, typer.Option(help="Where slaves connect to while no master runs.")
+]
+Insecure = Annotated[bool, typer.Option("--insecure", help="Allow addresses other than loopback.")]
 ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
 
 
@@ -72,6 +86,10 @@ def run(  # noqa: PLR0917  options of the command line
     step_size: Annotated[
         float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
     ] = None,
+    state: Annotated[
+        str | None,
+        typer.Option(help="How all slaves save their states: native, fork, replay or none."),
+    ] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Run the slaves in this process, without a bus.")
     ] = False,
@@ -87,11 +105,18 @@ def run(  # noqa: PLR0917  options of the command line
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
     ] = False,
+    tls: Tls = None,
+    mode: Annotated[
+        str | None, typer.Option(help="peer: reach slaves directly; client: through a router.")
+    ] = None,
     timeout: Annotated[
         float | None, typer.Option(help="How long to wait for slaves to appear [s].")
     ] = None,
     pin: Annotated[
         bool, typer.Option("--pin", help="Keep each launched slave on one processor.")
+    ] = False,
+    no_examine: Annotated[
+        bool, typer.Option("--no-examine", help="Let the slaves take no trial steps first.")
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
@@ -121,11 +146,15 @@ def run(  # noqa: PLR0917  options of the command line
                 start_time=start_time,
                 stop_time=stop_time,
                 initial_step_size=step_size,
+                examine=False if no_examine else None,
             )
+            .with_slaves(state=state)
             .with_bus(
                 connect=tuple(connect or ()),
                 listen=tuple(listen or ()),
                 insecure=insecure,
+                tls=None if tls is None else str(tls.absolute()),
+                mode=mode,
                 discovery_timeout=timeout,
                 pin=pin,
             )
@@ -228,6 +257,74 @@ def export(
     path = output or system_file.with_suffix(".ssp")
     export_system(system_file, path)
     typer.echo(path)
+
+
+@app.command("list")
+def list_(
+    connect: Connect = None,
+    listen: Listen = None,
+    insecure: Insecure = False,
+    tls: Tls = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Show the slaves, co-simulations and routers on the bus."""
+    from rich.console import Console  # noqa: PLC0415
+
+    from master_node.listing import listing_data, listing_tables  # noqa: PLC0415
+    from master_node.survey import survey  # noqa: PLC0415
+    from master_node.windows import windows  # noqa: PLC0415
+
+    with (
+        _interruptible(),
+        windows(
+            connect or (), listen or (), insecure=insecure, credentials=_credentials(tls)
+        ) as opened,
+    ):
+        for window in opened:
+            if window.failure is not None:
+                log.warning("%s", window.failure)
+        participants = survey([window.bus for window in opened if window.bus is not None])
+    if as_json:
+        typer.echo(json.dumps(listing_data(participants), indent=2))
+        return
+    for table in listing_tables(participants):
+        Console().print(table)
+    if not participants:
+        log.warning("nobody is on the bus; `master-node doctor` says what to look at")
+
+
+@app.command()
+def doctor(
+    connect: Connect = None,
+    listen: Listen = None,
+    insecure: Insecure = False,
+    tls: Tls = None,
+) -> None:
+    """Look for what would keep a run from working; exit code 1 when there is something."""
+    from rich.console import Console  # noqa: PLC0415
+
+    from master_node.doctor import diagnose  # noqa: PLC0415
+    from master_node.plain_text import plain  # noqa: PLC0415
+    from master_node.windows import windows  # noqa: PLC0415
+
+    with (
+        _interruptible(),
+        windows(
+            connect or (), listen or (), insecure=insecure, credentials=_credentials(tls)
+        ) as opened,
+    ):
+        diagnosis = diagnose(opened)
+    for table in diagnosis.tables():
+        Console().print(table)
+    for problem in diagnosis.problems:
+        typer.echo(plain(f"{problem.where}: {problem.cause}; {problem.remedy}"))
+    if diagnosis.problems:
+        raise typer.Exit(1)
+    typer.echo("no problem found")
+
+
+def _credentials(directory: Path | None) -> Credentials | None:
+    return None if directory is None else Credentials(directory.absolute(), Role.MASTER)
 
 
 def _order(text: str | None) -> int | str | None:

@@ -56,7 +56,7 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
     warnings = []
     for part in coupled.parts:
         can = part.description.capabilities
-        fixed = system.slaves[part.name].step_size
+        fixed = system.slaves[part.name].step_size or part.description.fixed_step_size
         if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:
             raise ConfigurationError(
                 f"{part.name}: the model cannot handle variable communication step sizes",
@@ -130,12 +130,15 @@ class CoSimulation:
         coupled: their connections.
         system: the settings.
         observer: is told of everything.
+        outputs: at T_0 of slaves that stand there already; None: they are
+            still to be initialized.
     """
 
     group: SlaveGroup
     coupled: CoupledSystem
     system: System
     observer: Observer
+    outputs: Outputs | None = None
 
     def run(self) -> Statistics:
         """Initialize, step to the stop time, terminate.
@@ -148,7 +151,9 @@ class CoSimulation:
         """
         settings = self.system.simulation
         scheme = CouplingScheme.of(self.coupled, self.system)
-        outputs = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
+        outputs = self.outputs
+        if outputs is None:
+            outputs = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
         self.group.restart_statistics()
         statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
         self.observer.started(

@@ -124,6 +124,7 @@ class SimulationSettings(_Table):
             ``none`` where the order is chosen, else ``rest``.
         output_interval: write results at start_time + i output_interval [s], by dense output,
             instead of at the communication points.
+        examine: let the slaves take trial steps before the first step, see ``examinations.py``.
     """
 
     preset: Literal["paper"] | None = None
@@ -149,6 +150,7 @@ class SimulationSettings(_Table):
     largest_step_size: Positive | None = None
     initial_history: Literal["rest", "none"] | None = None
     output_interval: Positive | None = None
+    examine: StrictBool = True
 
     @model_validator(mode="before")
     @classmethod
@@ -305,6 +307,11 @@ class SlaveSettings(_Table):
         smallest_step_size, largest_step_size: bounds of its communication steps [s].
         outputs_follow_inputs: whether its outputs can be read again after inputs were set, without
             a step in between (FMI 2.0 does not promise it); default: what is known of its kind.
+        input_substeps: into how many substeps its node splits each step, with constant inputs in
+            each, to follow polynomial inputs; 1: the inputs are constant in each step; 0: input
+            derivatives where the model takes them, else as many substeps as the accuracy needs.
+        largest_substep: its node splits steps so that no step of the model is longer [s].
+        state: how its state is saved; default: the best way that the model and its host allow.
     """
 
     model: StrictStr | None = None
@@ -317,6 +324,9 @@ class SlaveSettings(_Table):
     smallest_step_size: Positive | None = None
     largest_step_size: Positive | None = None
     outputs_follow_inputs: StrictBool | None = None
+    input_substeps: Annotated[StrictInt, Field(ge=0, le=10_000)] = 0
+    largest_substep: Positive | None = None
+    state: Literal["native", "fork", "replay", "none"] | None = None
 
 
 class Connection(_Table):
@@ -457,22 +467,28 @@ class BusSettings(_Table):
     """The ``[bus]`` table.
 
     Attributes:
+        mode: ``peer``: connected to each slave; ``client``: connected to a router, as all slaves.
         listen: where slaves that are not started by this master can connect to; default: the
             loopback port 7447 when there are such slaves and nothing to connect to.
-        connect: slaves that listen.
-        insecure: allow addresses other than loopback.
+        connect: slaves that listen, or the router; default of a client: the loopback port 7447.
+        insecure: allow addresses other than loopback without TLS.
+        tls: directory with certificates, relative to the system file; None: no TLS.
         discovery_timeout: how long to wait for slaves to appear [s].
         step_timeout: how long one request may take [s].
+        reconnect_time: how long to wait in mid run for a slave whose connection was lost [s].
         pin: keep the node and the worker of each launched slave on one processor, so that a
             request is handed over without waking another one. For small models; a model with
             threads of its own would have only that processor.
     """
 
+    mode: Literal["peer", "client"] = "peer"
     listen: tuple[StrictStr, ...] = ()
     connect: tuple[StrictStr, ...] = ()
     insecure: StrictBool = False
+    tls: StrictStr | None = None
     discovery_timeout: Positive = 30.0
     step_timeout: Positive = 60.0
+    reconnect_time: Annotated[Number, Field(gt=0, le=3000)] = 10.0
     pin: StrictBool = False
 
 
@@ -526,6 +542,11 @@ class System(_Table):
                 raise ValueError(str(error)) from None
         return self
 
+    @property
+    def certificates(self) -> Path | None:
+        """The directory with certificates for TLS."""
+        return None if self.bus.tls is None else self.base / self.bus.tls
+
     def checked(self) -> Self:
         """The system itself, as nothing more can be added to it.
 
@@ -550,6 +571,20 @@ class System(_Table):
             simulation |= {**_PAPER, "order": _PAPER["order"] if order == "auto" else order}
         simulation |= given
         return self._with(simulation=simulation)
+
+    def with_slave(self, name: str, **settings: Any) -> System:
+        """The same system with other settings of one slave."""
+        changed = self.slaves[name].model_dump(exclude_unset=True) | settings
+        return self._with(slaves={**self.slaves, name: changed})
+
+    def with_slaves(self, **settings: Any) -> System:
+        """The same system with other settings of all slaves; None leaves one as it is."""
+        given = {name: value for name, value in settings.items() if value is not None}
+        slaves = {
+            name: slave.model_dump(exclude_unset=True) | given
+            for name, slave in self.slaves.items()
+        }
+        return self._with(slaves=slaves)
 
     def with_bus(self, **settings: Any) -> System:
         """The same system with other bus settings; None and empty ones leave one as it is."""

@@ -59,6 +59,8 @@ class Position:
         smooth: step size and largest defect of the last accepted step.
         errors_in_a_row: attempts that a slave ended with an error.
         event: where a slave has returned early, and a double step must end [s]; None: nowhere.
+        unchanged: up to where discrete outputs are known not to change, and a double step must end
+            [s]; None: nowhere.
     """
 
     history: CouplingHistory
@@ -70,6 +72,7 @@ class Position:
     smooth: tuple[float, float] | None = None
     errors_in_a_row: int = 0
     event: float | None = None
+    unchanged: float | None = None
 
     @property
     def time(self) -> float:
@@ -103,6 +106,11 @@ class ControlledRun:
         # Where H is a multiple of something a double step cannot end wherever a kink is.
         kinks = external.kinks if self._limits.quantum is None else ()
         self._landing_points = LandingPoints(kinks, self._limits.smallest)
+        self._searches_changes = (
+            settings.discontinuities
+            and coupled.discrete.holds_inputs
+            and self._limits.quantum is None
+        )
         self._stepper = self._make_stepper(context, estimator)
         self._control = self._make_control(context, estimator)
         self._defects = InputDefects(coupled, scheme, self._control)
@@ -236,8 +244,8 @@ class ControlledRun:
         wanted = step_within(
             position.bracket, position.time, position.step_size, self._limits.smallest
         )
-        if position.event is not None:
-            target = min(target, position.event)
+        nearer = (position.event, position.unchanged)
+        target = min([target, *(time for time in nearer if time is not None)])
         target = self._landing_points.target(
             position.time, wanted, target, first=position.controller.rejected
         )
@@ -260,6 +268,10 @@ class ControlledRun:
                 event = event or f"{self._defects.name(defects)} jumps"
         if event and self._is_smallest(times):
             return self._accept_jump(position, step, error, event)
+        if self._searches_changes:
+            searched = self._search_change(position, step, error)
+            if searched is not None:
+                return searched
         if error.norm <= 1.0 and not jumps:
             return self._accept(position, step, error, defects)
         return self._reject(position, step, error, defects)
@@ -393,6 +405,8 @@ class ControlledRun:
         remedy = "raise the tolerances or lower smallest_step_size"
         if self._limits.smallest == self._limits.largest:
             remedy = "raise the tolerances: a slave takes no other step size"
+        elif self._limits.quantum is not None and times.first == float(self._limits.quantum):
+            remedy = f"raise the tolerances: step sizes are multiples of {times.first!r} s"
         return StepSizeError(
             f"rejected at the smallest communication step size: {reason}",
             phase="double step",
@@ -440,6 +454,33 @@ class ControlledRun:
         if step.times.end >= self._settings.end:
             return behind
         return self._with_initial_step_size(behind, position.step_size)
+
+    def _search_change(
+        self, position: Position, step: DoubleStep, error: StepError
+    ) -> Position | None:
+        """Go back where a discrete output changes, until its delay is within the tolerance.
+
+        A change in the first small step makes the second one other than the comparison solution, so
+        ERR says what it does to hand it over late. One in the second small step shows in no
+        estimate: a double step must end before it, and the next one meets it in its first step.
+
+        Returns:
+            What to try next; None: there is nothing to search.
+        """
+        times = step.times
+        d_middle, d_end = step.discrete
+        changed = self._coupled.discrete.changed
+        name = changed(d_middle, d_end)
+        if name:
+            following = replace(position, unchanged=times.middle, step_size=times.second)
+        else:
+            name = changed(position.outputs.d, d_middle)
+            if not name or error.norm <= 1.0:
+                return None
+            following = replace(position, step_size=0.5 * times.first)
+        self._statistics.double_steps_at_discontinuities += 1
+        self._tell_rejected(times, step.polynomials, error.norm, f"{name} changes")
+        return replace(following, step_size=self._controller.bounded(following.step_size))
 
     def _event(self, position: Position, step: DoubleStep) -> str:
         """What changed at once in a double step, in words; "" if nothing did."""

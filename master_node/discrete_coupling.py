@@ -131,7 +131,7 @@ def couple_discrete(
     units: list[str] = []
     slices = []
     for slave, description in descriptions.items():
-        outputs = [v for v in description.of(Causality.OUTPUT) if not v.is_continuous_real]
+        outputs = [v for v in description.of(Causality.OUTPUT) if v.is_discrete]
         slices.append(slice(len(keys), len(keys) + len(outputs)))
         keys += [(slave, variable.name) for variable in outputs]
         types += [variable.type for variable in outputs]

@@ -7,7 +7,7 @@ of slaves, when all slaves take their steps at once:
     EST_Rich  1: GetState, SetInputs(u~), DoStep(T, 2H), SetState, SetInputs(u), DoStep(T, H)
               2: SetInputs(u_new), DoStep(T+H, H)
     EST_mod   1: GetState, SetInputs(u), DoStep(T, H), GetState, SetInputs(u), DoStep(T+H, H)
-              2: SetState, SetInputs(u_new), DoStep(T+H, H)
+              2: SetState and free, SetInputs(u_new), DoStep(T+H, H)
 
 In front of request 1 stands what the last attempt calls for: after an accepted step the state is
 saved (over the old one, which is freed with that), after a rejected one the old one is restored.

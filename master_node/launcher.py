@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from secrets import token_hex
@@ -28,13 +29,15 @@ class Launcher:
     A slave ends when its standard input closes: a launched process never outlives this one.
 
     Args:
-        endpoint: of the master, to which the slaves connect.
+        connection: options of ``slave-node serve`` that lead the slaves to the bus.
         log_directory: existing; gets ``NAME.log`` of each slave.
         pin: give each slave one processor of its own, in turn, where the platform can.
     """
 
-    def __init__(self, endpoint: str, log_directory: Path, *, pin: bool = False) -> None:
-        self._endpoint = endpoint
+    def __init__(
+        self, connection: Sequence[str], log_directory: Path, *, pin: bool = False
+    ) -> None:
+        self._connection = connection
         self._processors = _processors() if pin else []
         self._log_directory = log_directory
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -62,10 +65,9 @@ class Launcher:
             "--base": str(base),
             "--name": name,
             "--instance": key.instance,
-            "--connect": self._endpoint,
         }
         command += [word for option in options.items() for word in option]
-        command.append("--stay-with-parent")
+        command += [*self._connection, "--stay-with-parent"]
         if self._processors:
             processor = self._processors[len(self._processes) % len(self._processors)]
             command += ["--processor", str(processor)]

@@ -6,8 +6,10 @@ import os
 import socket
 from collections.abc import Sequence
 
+from protocol.administration import Claim
 from protocol.bus import Bus, Caller, PendingReply
 from protocol.calls import Call, Reply
+from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.codec import (
     decode_map,
     decode_reply,
@@ -17,50 +19,71 @@ from protocol.codec import (
 )
 from protocol.errors import DoublestepError, SlaveLostError
 from protocol.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey
+from protocol.processes import has_ended
 from protocol.slave import StartValue
 
 _CLAIM_TIME = 90.0  # a slave whose worker died loads its model again first
 _GOODBYE_TIME = 0.3
-_LIVELINESS_TIME = 0.5
-_ATTEMPTS = 3
+_STATUS_TIME = 0.5
+_PAUSE = 0.02
+_ORPHAN_MARGIN = 5.0
+_LOSS_MARGIN = 1.0  # who watches the tokens says it earlier, and of whom
 
 
 def slave_status(bus: Bus, key: SlaveKey) -> dict[str, StartValue]:
     """What a slave says of itself."""
-    return decode_map(bus.caller(key.verb(STATUS), _LIVELINESS_TIME).request(b""))
+    return decode_map(bus.caller(key.verb(STATUS), _STATUS_TIME).request(b""))
 
 
 class RemoteSlave:
     """Implements `SlaveLink` over a bus.
+
+    A request without a reply is sent again with the same number, so it takes effect once, however
+    often the connection is lost.
 
     Args:
         bus: opened.
         key: of the slave.
         run: id of the run that claims it.
         step_timeout: bound on one request [s].
+        reconnect_time: how long in all a request waits for a slave that is not on the bus [s].
+            The slave is told to wait longer than that for its master.
+        clock: for its waits.
 
     Raises:
         SlaveBusyError: another run holds the slave.
         SlaveLostError, DeadlineError: it does not answer.
     """
 
-    def __init__(self, bus: Bus, key: SlaveKey, run: str, step_timeout: float) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        key: SlaveKey,
+        *,
+        run: str,
+        step_timeout: float,
+        reconnect_time: float,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
         self._bus = bus
         self._key = key
         self._step_timeout = step_timeout
+        self._reconnect_time = reconnect_time
+        self._clock = clock
+        self._changed = clock.condition()
+        self._is_present = True
+        self._loss: tuple[str, str] | None = None
         self._execute = self._caller()
         self._sequence = 0
         self._calls: Sequence[Call] = ()
         self._payload = b""
         self._pending: PendingReply | None = None
-        self._gone = ""
-        claim: dict[str, StartValue] = {
-            "run": run,
-            "host": socket.gethostname(),
-            "pid": os.getpid(),
-        }
-        answer = bus.caller(key.verb(CLAIM), _CLAIM_TIME).request(encode_map(claim))
-        self._epoch = int(decode_map(answer)["epoch"])
+        claim = Claim(run, socket.gethostname(), os.getpid(), reconnect_time + _ORPHAN_MARGIN)
+        caller = bus.caller(key.verb(CLAIM), _CLAIM_TIME)
+        answer = decode_map(caller.request(encode_map(claim.to_message())))
+        self._epoch = int(answer["epoch"])
+        self._host = str(answer.get("host", ""))
+        self._pid = int(answer.get("pid", 0))
 
     def _caller(self) -> Caller:
         return self._bus.caller(self._key.verb(EXECUTE), self._step_timeout)
@@ -69,6 +92,11 @@ class RemoteSlave:
     def key(self) -> SlaveKey:
         """Its address."""
         return self._key
+
+    @property
+    def has_ended(self) -> bool:
+        """True when its process was on this host and is no more; False: it may live."""
+        return has_ended(self._host, self._pid)
 
     def start(self, calls: Sequence[Call]) -> None:
         """See `SlaveLink`."""
@@ -91,34 +119,54 @@ class RemoteSlave:
         return decode_reply(self._calls, data)
 
     def _ask_again(self) -> bytes:
-        """No reply can mean a connection that is just coming back: while the slave is alive the
-        same number is sent again, which takes effect once at most.
-        """
-        for attempt in range(_ATTEMPTS):
-            if not self._bus.alive(self._key.alive, _LIVELINESS_TIME):
-                break
-            self._execute = self._caller()  # the old one may have been cancelled
-            if self._gone:
-                break
+        """No reply means a connection that was lost, or one that is just coming back."""
+        left = self._reconnect_time + _LOSS_MARGIN
+        while True:
+            begin = self._clock.monotonic()
+            caller = self._caller_when_present(left)
+            left -= self._clock.monotonic() - begin + _PAUSE
             try:
-                return self._execute.request(self._payload)
+                return caller.request(self._payload)
             except SlaveLostError:
-                if attempt == _ATTEMPTS - 1:
-                    raise
-        raise SlaveLostError(
-            "its process died or the connection to it was lost",
-            slave=self._gone,
-            remedy="see the slave's log for the reason",
-        )
+                self._clock.sleep(_PAUSE)
+
+    def _caller_when_present(self, timeout: float) -> Caller:
+        """Wait until the slave is on the bus; the old caller may have been cancelled."""
+        with self._changed:
+            came = self._changed.wait_for(lambda: self._is_present or self._loss, max(timeout, 0.0))
+        caller = self._caller()
+        with self._changed:
+            self._execute = caller  # from here on a loss cancels this one
+            if self._loss is not None:
+                slave, cause = self._loss
+                raise SlaveLostError(cause, slave=slave, remedy=_REMEDY)
+        if not came or timeout <= 0.0:
+            raise SlaveLostError(
+                f"did not answer within the reconnect_time of {self._reconnect_time:g} s",
+                remedy=_REMEDY,
+            )
+        return caller
 
     def lost(self) -> None:
         """Its liveliness token went away: let pending waits end now."""
-        self._execute.cancel()
+        with self._changed:
+            self._is_present = False
+            caller = self._execute
+        caller.cancel()
 
-    def abandon(self, gone: str) -> None:
-        """Slave ``gone`` does not come back, and ends the run: wait for this one no more."""
-        self._gone = gone
-        self._execute.cancel()
+    def returned(self) -> None:
+        """Its liveliness token is there again."""
+        with self._changed:
+            self._is_present = True
+            self._changed.notify_all()
+
+    def abandon(self, slave: str, cause: str) -> None:
+        """The run ends because of ``slave``: wait no more, neither for that one nor for this."""
+        with self._changed:
+            self._loss = (slave, cause)
+            caller = self._execute
+            self._changed.notify_all()
+        caller.cancel()
 
     def release(self) -> None:
         """Give the slave back, in a bounded short time; errors do not matter any more."""
@@ -134,3 +182,6 @@ class RemoteSlave:
             caller.request(encode_map({"epoch": self._epoch}))
         except DoublestepError:
             pass
+
+
+_REMEDY = "see the slave's log for the reason"

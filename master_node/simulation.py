@@ -11,8 +11,11 @@ from typing import Any
 
 from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.configuration import InputSettings, System
+from master_node.configure_slaves import configure
+from master_node.examinations import as_plain_data
 from master_node.input_loading import load_signals
 from master_node.observers import Observer, Observers
+from master_node.preparation import prepare
 from master_node.results import (
     Recording,
     Result,
@@ -22,7 +25,7 @@ from master_node.results import (
 )
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
-from master_node.step_size_rules import check_step_sizes
+from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.system import resolve
 from protocol.slave import SlaveDescription
 
@@ -90,19 +93,30 @@ def run(
     if directory is not None:
         ResultsWriter(directory, settings).prepare()
     with _slaves(system, directory, in_process=in_process, launch=launch) as slaves:
-        coupled = resolve(system, slaves.descriptions, signals)
-        for warning in check_capabilities(coupled, system):
+        descriptions = configure(slaves.links, system, slaves.descriptions)
+        system = with_fixed_steps(system, descriptions)
+        check_step_sizes(system)
+        warnings = check_capabilities(resolve(system, descriptions, signals), system)
+        for warning in warnings:
             log.warning("%s", warning)
+        group = SlaveGroup(slaves.links)
+        prepared = prepare(group, system, descriptions, signals)
+        coupled = resolve(prepared.system, prepared.descriptions, signals)
+        for warning in check_capabilities(coupled, prepared.system):
+            if warning not in warnings:
+                log.warning("%s", warning)
         wanted = system.results
         check_variables(
             wanted.variables, (*coupled.output_names, *coupled.discrete.names), system.source
         )
         keepers: list[Observer] = [] if recording is None else [recording]
         if directory is not None:
-            keepers.append(ResultsWriter(directory, settings_of(system, slaves.descriptions)))
+            settings = settings_of(prepared.system, prepared.descriptions)
+            settings["examinations"] = as_plain_data(prepared.examinations)
+            keepers.append(ResultsWriter(directory, settings))
         selected = SelectedResults(Observers(keepers), wanted.variables, wanted.every)
         observer = Observers([*observers, selected])
-        CoSimulation(SlaveGroup(slaves.links), coupled, system, observer).run()
+        CoSimulation(group, coupled, prepared.system, observer, prepared.outputs).run()
 
 
 @contextmanager

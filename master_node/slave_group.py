@@ -42,7 +42,7 @@ class SlaveGroup:
     def execute(
         self,
         programs: Sequence[Program],
-        time: float,
+        time: float | None = None,
         step_size: float | None = None,
         slaves: Sequence[int] | None = None,
     ) -> list[Reply]:
@@ -50,7 +50,7 @@ class SlaveGroup:
 
         Args:
             programs: one for each of these slaves, in order.
-            time: where the run stands [s], for error messages.
+            time: where the run stands [s], for error messages; None: nowhere yet.
             step_size: communication step size H [s], for error messages.
             slaves: indices of the slaves; None: all.
 

@@ -6,36 +6,36 @@ Each way is a context manager that gives a `Slaves` and leaves nothing running b
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from secrets import token_hex
 
+from master_node.announcement import announce_run
 from master_node.configuration import System
 from master_node.launcher import Launcher
-from master_node.remote_slave import RemoteSlave, slave_status
+from master_node.presence import Presence
+from master_node.remote_slave import RemoteSlave
 from master_node.slave_link import LocalSlave, SlaveLink
 from protocol.bus import DEFAULT_ENDPOINT, Bus
 from protocol.calls import Describe
 from protocol.clock import SYSTEM_CLOCK, Clock
+from protocol.credentials import Credentials, Role
+from protocol.endpoints import Endpoints, Mode, free_endpoint
 from protocol.errors import (
     ConfigurationError,
     DeadlineError,
     DoublestepError,
     InterruptedRunError,
-    ProtocolError,
     SlaveLostError,
 )
-from protocol.keys import SlaveKey, alive_master, alive_slaves
+from protocol.keys import SlaveKey
 from protocol.slave import SlaveDescription
-from protocol.zenoh_bus import Endpoints, ZenohBus, free_endpoint
+from protocol.zenoh_bus import ZenohBus
 
-_POLL_TIME = 0.02
-_RETURN_TIME = 0.5
 _DEATH_TIME = 1.0
-_LIVELINESS_TIME = 1.0
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,14 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
     found = [name for name in system.slaves if name not in launched]
     private = free_endpoint()
     with ExitStack() as stack:
-        bus = ZenohBus(_endpoints(system, private, launched=bool(launched), found=bool(found)))
+        endpoints = _endpoints(system, private, launched=bool(launched), found=bool(found))
+        bus = ZenohBus(endpoints, timeout=system.bus.discovery_timeout)
         stack.callback(bus.close)
         run = token_hex(4)
-        bus.announce(alive_master(run))
-        launcher = stack.enter_context(Launcher(private, log_directory, pin=system.bus.pin))
+        announce_run(bus, run, system)
+        launcher = stack.enter_context(
+            Launcher(_connection(endpoints, private), log_directory, pin=system.bus.pin)
+        )
         keys = {
             name: launcher.launch(name, str(system.slaves[name].model), system.base)
             for name in system.slaves
@@ -121,9 +124,20 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
         }
         presence = Presence(bus)
         keys |= presence.wait(found, keys, launcher, system.bus.discovery_timeout)
-        keys = {name: keys[name] for name in system.slaves}
+
+        def has_ended(remote: RemoteSlave) -> bool:
+            return remote.has_ended or launcher.ended(remote.key.name) is not None
+
         remotes = stack.enter_context(
-            claimed_slaves(bus, presence, keys, run=run, step_timeout=system.bus.step_timeout)
+            claimed_slaves(
+                bus,
+                presence,
+                {name: keys[name] for name in system.slaves},
+                has_ended,
+                run=run,
+                step_timeout=system.bus.step_timeout,
+                reconnect_time=system.bus.reconnect_time,
+            )
         )
         slaves = Slaves(remotes, describe(remotes), launcher)
         try:
@@ -142,18 +156,24 @@ def claimed_slaves(
     bus: Bus,
     presence: Presence,
     keys: Mapping[str, SlaveKey],
+    has_ended: Callable[[RemoteSlave], bool],
     *,
     run: str,
     step_timeout: float,
+    reconnect_time: float,
+    clock: Clock = SYSTEM_CLOCK,
 ) -> Iterator[dict[str, RemoteSlave]]:
-    """Claim slaves for a run, be told when one vanishes, and give them back at the end.
+    """Claim slaves for a run, look after them, and give them back at the end.
 
     Args:
         bus: on which they are.
         presence: follows their tokens.
         keys: their addresses by name, in the order in which they are claimed.
+        has_ended: whether it is certain that a slave's process is no more.
         run: id of the run.
         step_timeout: bound on one request [s].
+        reconnect_time: how long to wait for one that vanished [s].
+        clock: for all waits.
 
     Raises:
         SlaveBusyError, SlaveLostError, DeadlineError: one cannot be claimed; names it.
@@ -162,12 +182,18 @@ def claimed_slaves(
         remotes: dict[str, RemoteSlave] = {}
         for name, key in keys.items():
             try:
-                remotes[name] = RemoteSlave(bus, key, run, step_timeout)
+                remotes[name] = RemoteSlave(
+                    bus,
+                    key,
+                    run=run,
+                    step_timeout=step_timeout,
+                    reconnect_time=reconnect_time,
+                    clock=clock,
+                )
             except DoublestepError as error:
                 raise error.located(slave=name, phase="claim") from None
             stack.callback(remotes[name].release)
-        presence.on_loss({remote.key.alive: remote for remote in remotes.values()})
-        stack.callback(presence.on_loss, {})
+        stack.enter_context(presence.guarded(list(remotes.values()), has_ended, reconnect_time))
         yield remotes
 
 
@@ -190,119 +216,39 @@ def describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
 
 
 def _endpoints(system: System, private: str, *, launched: bool, found: bool) -> Endpoints:
-    listen = list(system.bus.listen)
-    if found and not listen and not system.bus.connect:
-        listen.append(DEFAULT_ENDPOINT)
-    if launched:
-        listen.append(private)
+    bus = system.bus
+    mode = Mode(bus.mode)
+    listen, connect = list(bus.listen), list(bus.connect)
+    if mode is Mode.CLIENT:
+        connect = connect or [DEFAULT_ENDPOINT]
+    else:
+        if found and not listen and not connect:
+            listen.append(DEFAULT_ENDPOINT)
+        if launched:
+            listen.append(private)
     try:
-        return Endpoints(tuple(listen), tuple(system.bus.connect), system.bus.insecure)
+        credentials = (
+            None
+            if system.certificates is None
+            else Credentials(system.certificates.absolute(), Role.MASTER)
+        )
+        return Endpoints(tuple(listen), tuple(connect), bus.insecure, mode, credentials)
     except ConfigurationError as error:
         raise ConfigurationError(
             f"{system.source}: [bus] {error.cause}", remedy=error.remedy
         ) from None
 
 
-class Presence:
-    """Which slaves are on the bus, as their liveliness tokens come and go.
-
-    Args:
-        bus: opened.
-        clock: for its waits.
-    """
-
-    def __init__(self, bus: Bus, clock: Clock = SYSTEM_CLOCK) -> None:
-        self._bus = bus
-        self._clock = clock
-        self._changed = clock.condition()
-        self._alive: set[SlaveKey] = set()
-        self._remotes: Mapping[str, RemoteSlave] = {}
-        bus.watch(alive_slaves(), self._told)
-
-    def _told(self, key: str, alive: bool) -> None:
-        slave = SlaveKey.from_alive(key)
-        if slave is None:
-            return
-        with self._changed:
-            (self._alive.add if alive else self._alive.discard)(slave)
-            self._changed.notify_all()
-        remote = self._remotes.get(key)
-        if remote is not None and not alive:
-            self._lost(remote)
-
-    def on_loss(self, remotes: Mapping[str, RemoteSlave]) -> None:
-        """From now on tell these slaves' links when their token goes away."""
-        with self._changed:
-            self._remotes = remotes
-            lost = [remote for remote in remotes.values() if remote.key not in self._alive]
-        for remote in lost:
-            self._lost(remote)
-
-    def _lost(self, remote: RemoteSlave) -> None:
-        remote.lost()
-        self._clock.later(_RETURN_TIME, lambda: self._abandon(remote.key))
-
-    def _abandon(self, gone: SlaveKey) -> None:
-        """A slave that stays away ends the run, however long the steps of the others take."""
-        with self._changed:
-            remotes = [] if gone in self._alive else list(self._remotes.values())
-        for remote in remotes:
-            remote.abandon(gone.name)
-
-    def wait(
-        self, names: list[str], keys: Mapping[str, SlaveKey], launcher: Launcher, timeout: float
-    ) -> dict[str, SlaveKey]:
-        """Wait until slaves called ``names`` and those at ``keys`` are alive.
-
-        Returns:
-            The keys of the slaves called ``names``.
-        """
-        deadline = self._clock.monotonic() + timeout
-        while True:
-            launcher.check()
-            with self._changed:
-                alive = set(self._alive)
-            missing = [n for n in names if not any(k.name == n for k in alive)]
-            missing += [name for name, key in keys.items() if key not in alive]
-            found = {} if missing else self._only_instances((*names, *keys))
-            missing = missing or [name for name in names if name not in found]
-            if not missing:
-                return {name: found[name] for name in names}
-            if self._clock.monotonic() > deadline:
-                raise self._not_found(missing, alive, timeout)
-            with self._changed:
-                self._changed.wait(_POLL_TIME)
-
-    def _only_instances(self, names: Sequence[str]) -> dict[str, SlaveKey]:
-        """Asked for now: the one slave of each name; none of one that has just gone again."""
-        found = {}
-        for name in names:
-            tokens = self._bus.alive(alive_slaves(name), _LIVELINESS_TIME)
-            instances = [k for k in map(SlaveKey.from_alive, tokens) if k is not None]
-            if len(instances) > 1:
-                raise ProtocolError(
-                    f"{len(instances)} instances of {name!r}: "
-                    + ", ".join(self._whereabouts(k) for k in instances),
-                    slave=name,
-                    remedy="end all but one of them",
-                )
-            if instances:
-                found[name] = instances[0]
-        return found
-
-    @staticmethod
-    def _not_found(missing: list[str], alive: set[SlaveKey], timeout: float) -> SlaveLostError:
-        there = ", ".join(sorted({k.name for k in alive})) or "no slave at all"
-        return SlaveLostError(
-            f"did not appear within {timeout:g} s; found on the bus: {there}",
-            slave=", ".join(missing),
-            phase="discovery",
-            remedy="start it with `slave-node serve MODEL --name NAME`, or check --connect "
-            "and --listen on both sides",
-        )
-
-    def _whereabouts(self, key: SlaveKey) -> str:
-        with suppress(DoublestepError):
-            status = slave_status(self._bus, key)
-            return f"{status.get('host')!s}/{status.get('pid')!s}"
-        return key.instance
+def _connection(endpoints: Endpoints, private: str) -> list[str]:
+    """The options by which a slave that is started here comes to the same bus."""
+    words = []
+    if endpoints.mode is Mode.CLIENT:
+        words = ["--mode", "client"]
+        words += [word for endpoint in endpoints.connect for word in ("--connect", endpoint)]
+    else:
+        words = ["--connect", private]
+    if endpoints.insecure:
+        words.append("--insecure")
+    if endpoints.credentials is not None:
+        words += ["--tls", str(endpoints.credentials.directory)]
+    return words

@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from protocol.errors import ConfigurationError
-from protocol.slave import SlaveDescription, StartValue, Variable, VariableType
+from protocol.slave import Causality, SlaveDescription, StartValue, Variable, VariableType
 
 GivenValue = StartValue | Sequence["GivenValue"]
 """A value, or for an array its rows."""
 
 
+def structural_parameters(description: SlaveDescription) -> frozenset[str]:
+    """Names of the parameters that size a slave, and are set before all others."""
+    return frozenset(v.name for v in description.of(Causality.STRUCTURAL_PARAMETER))
+
+
 def start_values(
     description: SlaveDescription, given: Mapping[str, GivenValue]
 ) -> dict[str, StartValue]:
-    """Start values by the names of single variables.
+    """Start values by the names of single variables, but for those of structural parameters.
 
     Args:
         description: of the slave.
@@ -26,7 +31,10 @@ def start_values(
     """
     variables = {variable.name: variable for variable in description.variables}
     values: dict[str, StartValue] = {}
+    structural = structural_parameters(description)
     for name, value in given.items():
+        if name in structural:
+            continue
         for element, number in _elements(name, value):
             variable = variables.get(element)
             if variable is None:

@@ -39,7 +39,7 @@ _HALFWAY = 1
 SAVE_POINT = GetState(_AT_POINT)
 RESTORE_POINT = SetState(_AT_POINT)
 SAVE_HALFWAY = GetState(_HALFWAY)
-RESTORE_HALFWAY = SetState(_HALFWAY)
+RESTORE_HALFWAY = SetState(_HALFWAY, free=True)
 
 
 @dataclass(frozen=True, slots=True)

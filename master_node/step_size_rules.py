@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from master_node.configuration import System
 from master_node.external_inputs import Jump
@@ -14,6 +14,19 @@ from master_node.numerics.step_size_limits import (
     StepSizeLimitsError,
 )
 from protocol.errors import ConfigurationError
+from protocol.slave import SlaveDescription
+
+
+def with_fixed_steps(system: System, descriptions: Mapping[str, SlaveDescription]) -> System:
+    """The system with a ``step_multiple`` for each slave whose model takes steps of one size.
+
+    Its node splits a communication step into as many of them. Given rules of the slave win.
+    """
+    for name, description in descriptions.items():
+        settings, fixed = system.slaves[name], description.fixed_step_size
+        if fixed is not None and settings.step_size is None and settings.step_multiple is None:
+            system = system.with_slave(name, step_multiple=fixed)
+    return system
 
 
 def step_size_limits(system: System) -> StepSizeLimits:

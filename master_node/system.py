@@ -297,7 +297,7 @@ def _parts(
                     v.name for v in connected if not feeding[name][v.name].is_continuous
                 ),
                 discrete_outputs=tuple(
-                    v.name for v in description.of(Causality.OUTPUT) if not v.is_continuous_real
+                    v.name for v in description.of(Causality.OUTPUT) if v.is_discrete
                 ),
                 held=external[name].held,
                 input_slice=slice(n, n + len(inputs)),

@@ -37,12 +37,24 @@ class Condition(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None: ...
 
-    def wait(self, timeout: float) -> bool:
+    def wait(self, timeout: float | None = None) -> bool:
         """Let the lock go until somebody notifies, at most ``timeout`` seconds."""
+        ...
+
+    def wait_for(self, predicate: Callable[[], object], timeout: float) -> object:
+        """The same until ``predicate`` holds; gives its last value."""
         ...
 
     def notify_all(self) -> None:
         """Wake all who wait."""
+        ...
+
+
+class Task(Protocol):
+    """What runs beside the others; what is used of `threading.Thread`."""
+
+    def join(self, timeout: float) -> None:
+        """Wait until it has ended, at most ``timeout`` seconds."""
         ...
 
 
@@ -53,12 +65,20 @@ class Clock(Protocol):
         """Seconds since some moment; never goes back, whatever happens to the wall clock."""
         ...
 
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        ...
+
     def lock(self) -> Lock:
         """A new lock."""
         ...
 
     def condition(self) -> Condition:
         """A new condition with a lock of its own."""
+        ...
+
+    def start(self, action: Callable[[], None], name: str) -> Task:
+        """Run ``action`` beside all else from now on, unless the process has ended."""
         ...
 
     def later(self, seconds: float, action: Callable[[], None]) -> None:
@@ -73,6 +93,10 @@ class SystemClock:
         """See `Clock`."""
         return time.monotonic()
 
+    def sleep(self, seconds: float) -> None:
+        """See `Clock`."""
+        time.sleep(seconds)
+
     def lock(self) -> Lock:
         """See `Clock`."""
         return threading.Lock()
@@ -80,6 +104,12 @@ class SystemClock:
     def condition(self) -> Condition:
         """See `Clock`."""
         return threading.Condition()
+
+    def start(self, action: Callable[[], None], name: str) -> Task:
+        """See `Clock`."""
+        thread = threading.Thread(target=action, name=name, daemon=True)
+        thread.start()
+        return thread
 
     def later(self, seconds: float, action: Callable[[], None]) -> None:
         """See `Clock`."""

@@ -5,6 +5,9 @@
     doublestep/slaves/<slave>/<instance>/<verb>     queryable: one verb, or a list of calls
     doublestep/slaves/<slave>/<instance>/alive      liveliness token of a slave
     doublestep/masters/<run>/alive                  liveliness token of a master
+    doublestep/masters/<run>/status                 queryable: what a master says of its run
+    doublestep/routers/<router>/alive               liveliness token of a router
+    doublestep/routers/<router>/status              queryable: what a router says of itself
 
 ``<instance>`` is made anew by each slave process, so that a query can never reach two slaves of
 the same name, nor one that was started again in between.
@@ -67,11 +70,66 @@ class SlaveKey:
         return None
 
 
+@dataclass(frozen=True, slots=True, order=True)
+class MasterKey:
+    """Address of the master of one run."""
+
+    run: str
+
+    @property
+    def alive(self) -> str:
+        """The key of its liveliness token."""
+        return f"{_ROOT}/masters/{self.run}/{_ALIVE}"
+
+    @property
+    def status(self) -> str:
+        """The key on which it tells of its run."""
+        return f"{_ROOT}/masters/{self.run}/{STATUS}"
+
+    @staticmethod
+    def from_alive(key: str) -> MasterKey | None:
+        """The address in the key of a liveliness token; None when it is none of a master."""
+        parts = key.split("/")
+        if len(parts) == 4 and parts[:2] == [_ROOT, "masters"] and parts[3] == _ALIVE:
+            return MasterKey(parts[2])
+        return None
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class RouterKey:
+    """Address of one router process."""
+
+    instance: str
+
+    @property
+    def alive(self) -> str:
+        """The key of its liveliness token."""
+        return f"{_ROOT}/routers/{self.instance}/{_ALIVE}"
+
+    @property
+    def status(self) -> str:
+        """The key on which it tells of itself."""
+        return f"{_ROOT}/routers/{self.instance}/{STATUS}"
+
+    @staticmethod
+    def from_alive(key: str) -> RouterKey | None:
+        """The address in the key of a liveliness token; None when it is none of a router."""
+        parts = key.split("/")
+        if len(parts) == 4 and parts[:2] == [_ROOT, "routers"] and parts[3] == _ALIVE:
+            return RouterKey(parts[2])
+        return None
+
+
+def alive_routers() -> str:
+    """Matches the liveliness tokens of all routers."""
+    return f"{_ROOT}/routers/*/{_ALIVE}"
+
+
 def alive_slaves(name: str = "*") -> str:
     """Matches the liveliness tokens of all slaves, or of all those called ``name``."""
     return f"{_ROOT}/slaves/{name}/*/{_ALIVE}"
 
 
 def alive_master(run: str) -> str:
-    """The key of the liveliness token of the master of ``run``."""
-    return f"{_ROOT}/masters/{run}/{_ALIVE}"
+    """The key of the liveliness token of the master of ``run``; of all masters for ``*``."""
+    return MasterKey(run).alive

@@ -153,6 +153,11 @@ class Variable:
         """True for what takes part in extrapolation and in the error norm."""
         return self.type.is_real and self.variability == "continuous"
 
+    @property
+    def is_discrete(self) -> bool:
+        """True for what is held between communication points; clocks carry no value."""
+        return not self.is_continuous_real and self.type is not VariableType.CLOCK
+
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
@@ -160,8 +165,9 @@ class Capabilities:
 
     Attributes:
         outputs_follow_inputs: outputs read after ``set_inputs``, without a step in between, belong
-            to the new inputs. FMI 2.0 does not let a master ask for that (section 4.2.4), so an
-            FMU has it only by the word of its user; Python models have it.
+            to the new inputs. FMI 2.0 does not let a master ask for that (section 4.2.4), so a
+            co-simulation FMU has it only by the word of its user; model exchange and Python models
+            have it.
     """
 
     can_get_and_set_state: bool = False
@@ -187,7 +193,8 @@ class SlaveDescription:
         state_kind: how its state is saved.
         state_reason: why it is not saved natively; "" if it is.
         input_derivatives: how it follows polynomial inputs.
-        fixed_step_size: the only communication step size that it takes [s]; None: any.
+        fixed_step_size: the only step size that the model takes [s]; its node makes a
+            communication step of a whole number of them. None: any.
         default_step_size: that the model recommends [s]; None: it does not.
         units: definitions of the units of its variables, by name; a unit that is not among them
             is only a name.

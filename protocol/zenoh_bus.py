@@ -1,24 +1,28 @@
 """The bus over Zenoh. The only file that knows `zenoh`.
 
-Safe by default: no scouting, explicit endpoints, loopback unless the user says otherwise aloud.
+Safe by default: no scouting, explicit endpoints (``endpoints.py``), and with certificates only who
+has one of a role is heard (``access.py``).
 Requests are queries: one querier per key, one reply, collected from the query's own channel, so
 that several can be under way at once. Measured reasons for each setting: ``docs/decisions/``.
 """
 
 from __future__ import annotations
 
-import ipaddress
 import json
+import logging
 import os
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 
+from protocol.access import access_control
 from protocol.bus import AliveListener, Bus, Caller, Handler, PendingReply
+from protocol.codec import MAX_MESSAGE_BYTES
+from protocol.credentials import Credentials
+from protocol.endpoints import Endpoints, Mode
 from protocol.errors import ConfigurationError, DeadlineError, SlaveLostError
+from protocol.reachability import Reach, probe_all
 
 os.environ.setdefault(
     "ZENOH_RUNTIME",
@@ -28,78 +32,29 @@ os.environ.setdefault(
 
 import zenoh
 
+log = logging.getLogger("protocol")
+
 _LEASE_MS = 2000
 _FIRST_CONNECTION_MS = 100  # `open` waits so long for it, often in full; the default is 500
 _TIMEOUT_PAYLOAD = b"Timeout"
+_CLIENT_ATTEMPT_MS = 300
+_PROBE_TIME = 2.0
+_PROBE_PERIOD = 1.0
+_DROPPED_BYTES = 4 * MAX_MESSAGE_BYTES  # what is shorter is refused with an answer
 _MAX_TOKENS = 4096
 _CLOSE_TIME = 1.0
 _REQUESTS_A_TOKEN = 512
 
 
-@dataclass(frozen=True, slots=True)
-class Endpoints:
-    """Where a participant listens and to what it connects, as ``tcp/HOST:PORT``.
-
-    Attributes:
-        listen: addresses to listen on; empty: none, the participant is a client.
-        connect: addresses to connect to, tried again for ever in the background.
-        insecure: allow addresses that are not loopback; the traffic is neither encrypted nor
-            authenticated.
-    """
-
-    listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = ()
-    insecure: bool = False
-
-    def __post_init__(self) -> None:
-        for endpoint in (*self.listen, *self.connect):
-            host = host_of(endpoint)
-            if not self.insecure and not _is_loopback(host):
-                raise ConfigurationError(
-                    f"{endpoint} is not a loopback address, and the traffic would be neither "
-                    "encrypted nor authenticated",
-                    remedy="say --insecure if the network is trusted",
-                )
-
-
-def host_of(endpoint: str) -> str:
-    """The host in ``tcp/HOST:PORT``.
-
-    Raises:
-        ConfigurationError: the endpoint has another form.
-    """
-    protocol, _, address = endpoint.partition("/")
-    host, colon, port = address.rpartition(":")
-    if protocol != "tcp" or not colon or not host or not port.isdecimal() or int(port) > 65535:
-        raise ConfigurationError(
-            f"{endpoint!r} is not an endpoint", remedy="write tcp/HOST:PORT, as tcp/127.0.0.1:7447"
-        )
-    return host.strip("[]")
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint on whose port nobody listens now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 def _config(endpoints: Endpoints) -> zenoh.Config:
     config = zenoh.Config()
+    is_client = endpoints.mode is Mode.CLIENT
     settings: dict[str, object] = {
-        "mode": "peer",
+        "mode": str(endpoints.mode),
         "listen/endpoints": list(endpoints.listen),
         "connect/endpoints": list(endpoints.connect),
-        "connect/timeout_ms": -1,
+        # Opening a client waits for its first connection, and this is asked again and again.
+        "connect/timeout_ms": _CLIENT_ATTEMPT_MS if is_client else -1,
         "connect/exit_on_failure": False,
         "connect/retry": {
             "period_init_ms": 50,
@@ -111,33 +66,124 @@ def _config(endpoints: Endpoints) -> zenoh.Config:
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": _LEASE_MS,
         "transport/link/tx/queue/size/data": 16,
+        "transport/link/rx/max_message_size": _DROPPED_BYTES,
         "transport/shared_memory/enabled": False,
     }
+    if endpoints.credentials is not None:
+        settings |= _tls(endpoints.credentials)
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
 
+def _tls(credentials: Credentials) -> dict[str, object]:
+    tls = "transport/link/tls"
+    return {
+        f"{tls}/root_ca_certificate": str(credentials.authority),
+        f"{tls}/listen_certificate": str(credentials.certificate),
+        f"{tls}/listen_private_key": str(credentials.key),
+        f"{tls}/connect_certificate": str(credentials.certificate),
+        f"{tls}/connect_private_key": str(credentials.key),
+        f"{tls}/enable_mtls": True,
+        f"{tls}/verify_name_on_connect": True,
+        "access_control": access_control(),
+    }
+
+
+def _secured(endpoints: Endpoints) -> tuple[str, ...]:
+    """What to connect to with a certificate."""
+    return endpoints.connect if endpoints.credentials is not None else ()
+
+
+def _open(endpoints: Endpoints) -> zenoh.Session:
+    try:
+        return zenoh.open(_config(endpoints))
+    except zenoh.ZError as error:
+        raise ConfigurationError(
+            f"cannot open the bus at {', '.join(endpoints.listen)}: {_first_line(error)}",
+            remedy="another process may use the port: end it or choose another with --listen",
+        ) from error
+
+
+def _open_client(
+    endpoints: Endpoints, timeout: float | None, stop: threading.Event
+) -> zenoh.Session:
+    """Try until a router is there; a short time each, as an attempt cannot be interrupted."""
+    where = ", ".join(endpoints.connect)
+    end = None if timeout is None else time.monotonic() + timeout
+    told = False
+    while not stop.is_set():
+        begin = time.monotonic()
+        try:
+            return zenoh.open(_config(endpoints))
+        except zenoh.ZError:
+            if not told:
+                log.info("waiting for a router at %s", where)
+                told = True
+            attempts = probe_all(_secured(endpoints), endpoints.credentials, _PROBE_TIME)
+            for attempt in attempts:
+                attempt.check()
+        if end is not None and time.monotonic() > end:
+            raise SlaveLostError(
+                f"no connection to {where} within {timeout:g} s",
+                phase="connect",
+                remedy="start the router with `slave-node router --listen ...`, or check --connect",
+            )
+        stop.wait(max(0.0, begin + _CLIENT_ATTEMPT_MS / 1000 - time.monotonic()))
+    raise SlaveLostError(f"ended while waiting for a router at {where}")
+
+
 class ZenohBus(Bus):
     """One Zenoh session. Never fork a process that holds one.
 
+    Args:
+        endpoints: where to listen and to connect.
+        timeout: how long a client waits for its router [s]; None: for ever.
+        stop: when it is set, a client waits no more.
+
     Raises:
-        ConfigurationError: an address cannot be listened on.
+        ConfigurationError: an address cannot be listened on, or who is there does not accept our
+            certificate.
+        SlaveLostError: a client found no router in time.
     """
 
-    def __init__(self, endpoints: Endpoints) -> None:
+    def __init__(
+        self,
+        endpoints: Endpoints,
+        timeout: float | None = None,
+        stop: threading.Event | None = None,
+    ) -> None:
         zenoh.init_log_from_env_or("off")
-        try:
-            self._session = zenoh.open(_config(endpoints))
-        except zenoh.ZError as error:
-            raise ConfigurationError(
-                f"cannot open the bus at {', '.join(endpoints.listen)}: {_first_line(error)}",
-                remedy="another process may use the port: end it or choose another with --listen",
-            ) from error
+        probes = probe_all(_secured(endpoints), endpoints.credentials, _PROBE_TIME)
+        for attempt in probes:
+            attempt.check()
         self._closing = threading.Event()
         self._close_lock = threading.RLock()
         self._threads: list[threading.Thread] = []
         self._kept: list[object] = []
+        if endpoints.mode is Mode.CLIENT:
+            self._session = _open_client(endpoints, timeout, stop or self._closing)
+        else:
+            self._session = _open(endpoints)
+            left = [a.endpoint for a in probes if a.reach is not Reach.REACHED]
+            if left and endpoints.credentials is not None:
+                self._explain_later(left, endpoints.credentials)
+
+    def _explain_later(self, endpoints: list[str], credentials: Credentials) -> None:
+        """Who was not there yet may turn out not to accept us, of which Zenoh tells nothing."""
+
+        def look() -> None:
+            left = endpoints
+            while left and not self._closing.wait(_PROBE_PERIOD):
+                attempts = probe_all(left, credentials, _PROBE_TIME)
+                for attempt in attempts:
+                    try:
+                        attempt.check()
+                    except ConfigurationError as error:
+                        log.error("%s", error)
+                left = [a.endpoint for a in attempts if a.reach is Reach.NOT_REACHED]
+
+        threading.Thread(target=look, name="reachability", daemon=True).start()
 
     def caller(self, key: str, timeout: float) -> Caller:
         """See `Bus`."""

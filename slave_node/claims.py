@@ -9,17 +9,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from protocol.administration import DEFAULT_ORPHAN_TIME
 from protocol.errors import SequenceError, SlaveBusyError
 
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """A master. ``since`` is for people: the wall-clock time of its claim."""
+    """A master.
+
+    Attributes:
+        run: id of its run.
+        host, pid: its process.
+        since: wall-clock time of its claim, for people.
+        orphan_time: how long it is waited for when it vanished [s].
+        claimed: time of its claim in seconds since 1970.
+    """
 
     run: str
     host: str
     pid: int
     since: str
+    orphan_time: float = DEFAULT_ORPHAN_TIME
+    claimed: float = 0.0
 
     def __str__(self) -> str:
         return f"run {self.run} on {self.host} (pid {self.pid}) since {self.since}"

@@ -20,8 +20,10 @@ from typing import Annotated, Any
 import typer
 
 from protocol.bus import DEFAULT_ENDPOINT
+from protocol.credentials import Credentials, Role
+from protocol.endpoints import Endpoints, Mode
 from protocol.errors import ConfigurationError, DoublestepError
-from protocol.keys import SlaveKey, check_name
+from protocol.keys import RouterKey, SlaveKey, check_name
 from protocol.slave import StartValue
 
 app = typer.Typer(
@@ -35,6 +37,11 @@ log = logging.getLogger("slave_node")
 
 Model = Annotated[
     str, typer.Argument(help="An .fmu file, package.module:Class or path/to/file.py:Class.")
+]
+
+Tls = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Certificates: encrypt, and let in only who has one."),
 ]
 
 
@@ -57,9 +64,20 @@ def serve(  # noqa: PLR0917  options of the command line
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
     ] = False,
+    tls: Tls = None,
+    mode: Annotated[
+        Mode, typer.Option(help="peer: reach masters directly; client: through a router.")
+    ] = Mode.PEER,
     fmi_logging: Annotated[
         bool, typer.Option("--fmi-logging", help="Let the FMU log all categories.")
     ] = False,
+    state: Annotated[
+        str,
+        typer.Option(
+            help="How its state is saved unless the master asks for another way: native, fork, "
+            "replay or none [default: the best that the model and this host allow]."
+        ),
+    ] = "",
     base: Annotated[
         Path, typer.Option(help="Directory to which the model's path is relative.")
     ] = Path(),
@@ -68,7 +86,7 @@ def serve(  # noqa: PLR0917  options of the command line
     processor: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
     """Load MODEL and serve it until SIGTERM or Ctrl-C."""
-    from protocol.zenoh_bus import Endpoints, ZenohBus  # noqa: PLC0415  keeps the worker light
+    from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  keeps the worker light
     from slave_node.node import SlaveNode  # noqa: PLC0415
     from slave_node.worker import ModelReference, WorkerProcess  # noqa: PLC0415
 
@@ -80,9 +98,11 @@ def serve(  # noqa: PLR0917  options of the command line
         listen=tuple(listen or ()),
         connect=tuple(connect or (() if listen else (DEFAULT_ENDPOINT,))),
         insecure=insecure,
+        mode=mode,
+        credentials=None if tls is None else Credentials(tls.absolute(), Role.SLAVE),
     )
     reference = ModelReference(
-        model, base.absolute(), key.name, _parameters(parameter or []), fmi_logging
+        model, base.absolute(), key.name, _parameters(parameter or []), fmi_logging, state
     )
     if processor is not None:
         os.sched_setaffinity(0, {processor})  # type: ignore[attr-defined,unused-ignore]  # Linux
@@ -108,11 +128,10 @@ def serve(  # noqa: PLR0917  options of the command line
         _end_with_parent(end)
     try:
         description = worker.start()
-        bus = ZenohBus(endpoints)
+        bus = ZenohBus(endpoints, stop=ending)
         node = SlaveNode(bus, worker, key, description)
         if not ending.is_set():
-            where = [f"at {e}" for e in endpoints.listen] + [f"to {e}" for e in endpoints.connect]
-            log.info("%s loaded; on the bus %s", model, ", ".join(where))
+            log.info("%s loaded; on the bus %s", model, _where(endpoints))
             node.serve()
     except DoublestepError:
         if not ending.is_set():  # else it is what the ending did to what was under way
@@ -122,6 +141,75 @@ def serve(  # noqa: PLR0917  options of the command line
             bus.close()
         worker.stop()
     log.info("ended")
+
+
+@app.command()
+def router(
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Address for masters and slaves [default: {DEFAULT_ENDPOINT}]."),
+    ] = None,
+    connect: Annotated[list[str] | None, typer.Option(help="Another router.")] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
+    ] = False,
+    tls: Tls = None,
+) -> None:
+    """Connect masters and slaves in mode client with each other, until SIGTERM or Ctrl-C."""
+    from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  each command imports what it needs
+    from slave_node.router import serve_router  # noqa: PLC0415
+
+    logging.basicConfig(
+        level=logging.INFO, stream=sys.stderr, format="%(asctime)s router: %(message)s"
+    )
+    endpoints = Endpoints(
+        listen=tuple(listen or (DEFAULT_ENDPOINT,)),
+        connect=tuple(connect or ()),
+        insecure=insecure,
+        mode=Mode.ROUTER,
+        credentials=None if tls is None else Credentials(tls.absolute(), Role.ROUTER),
+    )
+    ending = threading.Event()
+
+    def end(reason: str) -> None:
+        log.info("ending: %s", reason)
+        ending.set()
+
+    _end_on_signals(end)
+    bus = ZenohBus(endpoints)
+    try:
+        log.info("on the bus %s", _where(endpoints))
+        serve_router(bus, RouterKey(token_hex(4)), _where(endpoints), ending)
+    finally:
+        bus.close()
+    log.info("ended")
+
+
+@app.command()
+def certificates(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Where the authority is, or will be.")
+    ],
+    host: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME[=ADDRESS,...]",
+            help="Host by the name under which it is called, and further names or addresses.",
+        ),
+    ],
+    role: Annotated[
+        list[Role] | None, typer.Option(help="What the hosts may be [default: slave].")
+    ] = None,
+    days: Annotated[
+        int, typer.Option(min=1, max=3650, help="Validity of host certificates.")
+    ] = 825,
+) -> None:
+    """Make certificates for --tls: an authority in DIR, and what host NAME needs in DIR/NAME."""
+    from slave_node.certificates import Host, make_certificates  # noqa: PLC0415
+
+    hosts = [Host.parse(text) for text in host]
+    for path in make_certificates(directory, hosts, role or [Role.SLAVE], days):
+        typer.echo(path)
 
 
 @app.command()
@@ -142,6 +230,11 @@ def inspect(
     console = Console()
     for table in description_tables(description):
         console.print(table)
+
+
+def _where(endpoints: Endpoints) -> str:
+    places = [f"at {e}" for e in endpoints.listen] + [f"to {e}" for e in endpoints.connect]
+    return ", ".join(places)
 
 
 def _default_name(model: str) -> str:

@@ -29,7 +29,13 @@ from protocol.calls import (
     StepResult,
     Terminate,
 )
-from protocol.errors import DoublestepError, FatalSlaveError, LifeCycleError, SlaveError
+from protocol.errors import (
+    DoublestepError,
+    FatalSlaveError,
+    LifeCycleError,
+    ModelError,
+    SlaveError,
+)
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState, refusal
 from protocol.slave import Slave, SlaveDescription, StepStatus
 from slave_node.examination import examine
@@ -81,7 +87,13 @@ class Executor:
             Configure: self._configure,
             Initialize: self._initialize,
             ExitInitializationMode: lambda _: slave.exit_initialization_mode(),
-            Examine: lambda call: examine(slave, call.communication_point, call.step_size),
+            Examine: lambda call: examine(
+                slave,
+                call.communication_point,
+                call.step_size,
+                call.relative_tolerance,
+                call.absolute_tolerance,
+            ),
             SetInputs: lambda call: set_inputs(call.derivatives),
             SetDiscreteInputs: lambda call: slave.set_discrete_inputs(call.values),
             DoStep: lambda call: do_step(
@@ -166,14 +178,18 @@ class Executor:
         return error.located(phase=call.verb)
 
     def _configure(self, call: Configure) -> SlaveDescription:
-        """Replace the slave by one that is loaded as the call says."""
+        """Replace the slave by one that is loaded as the call says; if there is none, by itself."""
         if call != self._configuration:
             if self._load is None:
                 raise SlaveError(f"{self._slave.description.model} cannot be configured")
             self._snapshots.clear()
             self._slave.close()
             self._is_loaded = False
-            self._bind(self._load(call))
+            try:
+                self._bind(self._load(call))
+            except ModelError:
+                self._bind(self._load(self._configuration))
+                raise
             self._configuration = call
         return self._slave.description
 

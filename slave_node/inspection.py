@@ -9,7 +9,15 @@ from protocol.slave import SlaveDescription
 
 _STATE = {
     "native": "saved and restored by the model itself",
+    "fork": "saved by forking the process that holds the model",
+    "replay": "restored by doing everything again from the start time",
     "none": "cannot be saved: only a fixed communication step is possible (--estimator none)",
+}
+
+_INPUTS = {
+    "native": "yes",
+    "emulated": "no: its steps are split into substeps",
+    "none": "no",
 }
 
 
@@ -26,9 +34,9 @@ def _model(description: SlaveDescription) -> Table:
         "generation tool": description.generation_tool,
         "guid": description.guid,
         "sha256": description.sha256,
-        "state": _STATE.get(description.state_kind, description.state_kind),
+        "state": _state(description),
         "state can be serialized": _yes(can.can_serialize_state),
-        "interpolates inputs": _yes(can.can_interpolate_inputs),
+        "interpolates inputs": _INPUTS[description.input_derivatives],
         "output derivatives up to order": str(can.max_output_derivative_order),
         "variable communication step size": _yes(can.can_handle_variable_step_size),
         "outputs follow inputs without a step": _yes(can.outputs_follow_inputs),
@@ -39,9 +47,18 @@ def _model(description: SlaveDescription) -> Table:
         )
         or "none",
     }
+    if description.fixed_step_size is not None:
+        rows["only communication step size [s]"] = str(description.fixed_step_size)
+    if description.remarks:
+        rows["remarks"] = "; ".join(description.remarks)
     for name, value in rows.items():
         table.add_row(name, value or "-")
     return table
+
+
+def _state(description: SlaveDescription) -> str:
+    reason = f" ({description.state_reason})" if description.state_reason else ""
+    return _STATE[description.state_kind] + reason
 
 
 def _variables(description: SlaveDescription) -> Table:

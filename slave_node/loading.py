@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from protocol.slave import CallExecutor, Slave, SlaveDescription
 from slave_node.executor import Executor
 from slave_node.model import Model, describe
 from slave_node.model_loading import load_model_class
+from slave_node.states.ladder import choose, described, with_states
+from slave_node.substeps import input_derivatives, with_substeps
 
 DEFAULT = Configure()
 
@@ -24,7 +27,7 @@ def load_slave(
     log_all: bool = False,
     configuration: Configure = DEFAULT,
 ) -> Slave:
-    """The slave for ``model``.
+    """The slave for ``model``, whose state is saved as the configuration says or as is best.
 
     Args:
         model: path of an ``.fmu`` file, or ``package.module:Class`` or ``file.py:Class``; paths
@@ -38,18 +41,56 @@ def load_slave(
     Raises:
         ModelError: the model is missing, unusable, not for this platform, or cannot be run so.
     """
-    if _is_fmu(model):
-        from slave_node.fmu.fmi2 import Fmi2Slave  # noqa: PLC0415  a Python model needs no fmpy
+    choice = choose(_describe_alone(model, base), configuration.state_kind)
+    alone = replace(configuration, state_kind="")
+    numbers = count()
 
-        slave: Slave = Fmi2Slave((base / model).resolve(), scratch, name, log_all=log_all)
+    def load() -> Slave:
+        directory = scratch / f"model-{next(numbers)}"
+        directory.mkdir()
+        return load_model(model, base, name, directory, log_all=log_all, configuration=alone)
+
+    def load_forking(reason: str) -> Slave:
+        from slave_node.states.fork_slave import ForkSlave, HeldModel  # noqa: PLC0415  Linux only
+
+        return ForkSlave(HeldModel(model, base, name, scratch, log_all, alone), reason)
+
+    return with_states(choice, load, load_forking)
+
+
+def load_model(
+    model: str,
+    base: Path,
+    name: str,
+    scratch: Path,
+    *,
+    log_all: bool = False,
+    configuration: Configure = DEFAULT,
+) -> Slave:
+    """The slave of the model alone: its state is saved natively or not at all.
+
+    Arguments and errors as for `load_slave`, but ``configuration`` names no state kind.
+    """
+    if _is_fmu(model):
+        from slave_node.fmu.loading import load_fmu  # noqa: PLC0415  a Python model needs no fmpy
+
+        slave: Slave = load_fmu(
+            (base / model).resolve(),
+            scratch,
+            name,
+            log_all=log_all,
+            structural_parameters=configuration.structural_parameters,
+        )
+        configuration = replace(configuration, structural_parameters={})
     else:
         from slave_node.model_slave import ModelSlave  # noqa: PLC0415  and an FMU no scipy
 
         slave = ModelSlave(_model_class(model, base))
-    if configuration != DEFAULT and configuration != Configure(slave.description.state_kind):
+    rest = replace(configuration, largest_substep=None, input_substeps=0)
+    if rest != DEFAULT:
         slave.close()
-        raise ModelError(f"{model}: cannot be run as {configuration}")
-    return slave
+        raise ModelError(f"{model}: cannot be run as {rest}")
+    return with_substeps(slave, configuration)
 
 
 def describe_model(model: str, base: Path) -> SlaveDescription:
@@ -58,11 +99,19 @@ def describe_model(model: str, base: Path) -> SlaveDescription:
     Raises:
         ModelError: the model is missing or cannot be read.
     """
+    description = _describe_alone(model, base)
+    return described(description, choose(description))
+
+
+def _describe_alone(model: str, base: Path) -> SlaveDescription:
+    """The model as it says itself."""
     if _is_fmu(model):
         from slave_node.fmu.description import describe_fmu  # noqa: PLC0415  as above
 
-        return describe_fmu((base / model).resolve())
-    return describe(_model_class(model, base))
+        description = describe_fmu((base / model).resolve())
+    else:
+        description = describe(_model_class(model, base))
+    return replace(description, input_derivatives=input_derivatives(description))
 
 
 def _is_fmu(model: str) -> bool:
@@ -79,17 +128,26 @@ def _model_class(model: str, base: Path) -> type[Model]:
 
 
 def load_executor(
-    model: str, base: Path, name: str, scratch: Path, *, log_all: bool = False
+    model: str,
+    base: Path,
+    name: str,
+    scratch: Path,
+    *,
+    log_all: bool = False,
+    state_kind: str = "",
 ) -> CallExecutor:
     """The same, ready to execute calls and to load the model in another configuration.
 
-    What a worker uses, and a master that runs a slave in its own process.
+    What a worker uses, and a master that runs a slave in its own process. ``state_kind`` holds
+    where a configuration names none.
     """
     numbers = count()
 
     def load(configuration: Configure) -> Slave:
         directory = scratch / str(next(numbers))
         directory.mkdir()
+        if not configuration.state_kind:
+            configuration = replace(configuration, state_kind=state_kind)
         return load_slave(
             model, base, name, directory, log_all=log_all, configuration=configuration
         )

@@ -9,9 +9,11 @@ from __future__ import annotations
 import logging
 import os
 import socket
+import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
 
+from protocol.administration import DEFAULT_ORPHAN_TIME, Claim, SlaveStatus
 from protocol.bus import Bus
 from protocol.calls import CALLS, Call, Reply, Reset
 from protocol.clock import SYSTEM_CLOCK, Clock
@@ -45,8 +47,8 @@ from protocol.keys import (
     SlaveKey,
     alive_master,
     alive_slaves,
-    check_name,
 )
+from protocol.processes import has_ended
 from protocol.slave import SlaveDescription, StartValue
 from slave_node.claims import Claims, Holder
 from slave_node.worker import Worker
@@ -64,7 +66,8 @@ class SlaveNode:
         worker: started; the caller stops it.
         key: name and instance.
         description: of the slave that ``worker`` holds.
-        orphan_time: a slave whose master vanished without release resets itself after this [s].
+        orphan_time: a slave whose master vanished without release resets itself after this [s],
+            unless the master's claim says after how long.
         clock: for its waits and locks.
     """
 
@@ -74,7 +77,7 @@ class SlaveNode:
         worker: Worker,
         key: SlaveKey,
         description: SlaveDescription,
-        orphan_time: float = 5.0,
+        orphan_time: float = DEFAULT_ORPHAN_TIME,
         *,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
@@ -84,10 +87,11 @@ class SlaveNode:
         self._description = description
         self._orphan_time = orphan_time
         self._claims = Claims()
+        self._changes_of_master = 0
         self._clock = clock
         self._running = clock.lock()
         self._worker_alive = True
-        self._since = _now()
+        self._since = time.time()
 
     def serve(self) -> None:
         """Serve until the bus is closed; the token goes up last: alive means serving.
@@ -181,7 +185,7 @@ class SlaveNode:
 
     def _claim(self, data: bytes) -> bytes:
         try:
-            holder = _holder(decode_map(data))
+            holder = self._holder(Claim.from_message(decode_map(data)))
             with self._running:
                 new = self._claims.holder is None
                 if new:
@@ -189,11 +193,15 @@ class SlaveNode:
                 epoch = self._claims.claim(holder)
             if new:
                 log.info("claimed by %s", holder)
-                self._look_after(epoch, self._orphan_time)  # a claim may arrive after its run
+                self._look_after(epoch, holder.orphan_time)  # a claim may arrive after its run
         except DoublestepError as error:
             log.warning("claim refused: %s", error)
             return encode_error_map(error.located(slave=self._key.name, phase=CLAIM))
-        return encode_map({"epoch": epoch})
+        return encode_map({"epoch": epoch, "host": socket.gethostname(), "pid": os.getpid()})
+
+    def _holder(self, claim: Claim) -> Holder:
+        orphan_time = self._orphan_time if claim.orphan_time is None else claim.orphan_time
+        return Holder(claim.run, claim.host, claim.pid, _now(), orphan_time, time.time())
 
     def _release(self, data: bytes) -> bytes:
         try:
@@ -227,37 +235,48 @@ class SlaveNode:
 
     def _status(self, _: bytes) -> bytes:
         holder = self._claims.holder
-        return encode_map(
-            {
-                "name": self._key.name,
-                "instance": self._key.instance,
-                "host": socket.gethostname(),
-                "pid": os.getpid(),
-                "model": self._description.model,
-                "kind": self._description.kind,
-                "sha256": self._description.sha256,
-                "state": "free" if holder is None else "held",
-                "busy": self.busy,
-                "worker": "alive" if self._worker_alive else "dead",
-                "holder": None if holder is None else str(holder),
-                "since": self._since,
-                "protocol_version": PROTOCOL_VERSION,
-            }
+        status = SlaveStatus(
+            name=self._key.name,
+            instance=self._key.instance,
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            model=self._description.model,
+            kind=self._description.kind,
+            sha256=self._description.sha256,
+            capabilities=_capabilities(self._description),
+            state="free" if holder is None else "held",
+            busy=self.busy,
+            worker="alive" if self._worker_alive else "dead",
+            holder=None if holder is None else str(holder),
+            run=None if holder is None else holder.run,
+            held_since=None if holder is None else holder.claimed,
+            since=self._since,
+            time=time.time(),
+            protocol_version=PROTOCOL_VERSION,
         )
+        return encode_map(status.to_message())
 
     def _master_changed(self, key: str, alive: bool) -> None:
         holder = self._claims.holder
-        if alive or holder is None or key != alive_master(holder.run):
+        if holder is None or key != alive_master(holder.run):
+            return
+        self._changes_of_master += 1
+        if alive:
+            log.info("the master is there: %s", holder)
             return
         log.warning("the master is gone: %s", holder)
-        self._look_after(self._claims.epoch, 0.0 if _has_ended(holder) else self._orphan_time)
+        ended = has_ended(holder.host, holder.pid)
+        self._look_after(self._claims.epoch, 0.0 if ended else holder.orphan_time)
 
     def _look_after(self, epoch: int, wait: float) -> None:
         """See after ``wait`` seconds whether the master of ``epoch`` is there."""
-        self._clock.later(wait, lambda: self._reset_orphan(epoch))
+        changes = self._changes_of_master
+        self._clock.later(wait, lambda: self._reset_orphan(epoch, changes))
 
-    def _reset_orphan(self, epoch: int) -> None:
+    def _reset_orphan(self, epoch: int, changes: int) -> None:
         """Give a slave back whose master is gone; a step under way is for nobody any more."""
+        if changes != self._changes_of_master:
+            return  # it came meanwhile; if it went again, that is waited for anew
         holder = self._claims.holder
         try:
             if holder is None or self._bus.alive(alive_master(holder.run), _PEER_TIME):
@@ -273,11 +292,16 @@ class SlaveNode:
             log.info("not reset: %s", error)  # released meanwhile, or the node is ending
 
 
-def _holder(claim: Mapping[str, StartValue]) -> Holder:
-    run, host, pid = claim.get("run"), claim.get("host"), claim.get("pid")
-    if type(run) is not str or type(host) is not str or type(pid) is not int:
-        raise MalformedMessageError("a claim must hold run and host as texts, and pid as a number")
-    return Holder(check_name(run, "run id"), host, pid, _now())
+def _capabilities(description: SlaveDescription) -> str:
+    """In short what a master asks of a slave."""
+    can = description.capabilities
+    known = {
+        f"saves state ({description.state_kind})": can.can_get_and_set_state,
+        "variable steps": can.can_handle_variable_step_size,
+        "input derivatives": can.can_interpolate_inputs,
+        "output derivatives": can.max_output_derivative_order > 0,
+    }
+    return ", ".join(name for name, has in known.items() if has)
 
 
 def _epoch(message: Mapping[str, StartValue]) -> int:
@@ -285,19 +309,6 @@ def _epoch(message: Mapping[str, StartValue]) -> int:
     if type(epoch) is not int:
         raise MalformedMessageError("the message must hold an epoch")
     return epoch
-
-
-def _has_ended(holder: Holder) -> bool:
-    """True when the holder was a process on this host that is no more."""
-    if holder.host != socket.gethostname() or holder.pid <= 0 or os.name != "posix":
-        return False
-    try:
-        os.kill(holder.pid, 0)
-    except ProcessLookupError:
-        return True
-    except PermissionError:
-        pass  # it is there, and somebody else's
-    return False
 
 
 def _now() -> str:

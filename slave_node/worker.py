@@ -40,7 +40,7 @@ _PR_SET_PDEATHSIG = 1
 @dataclass(frozen=True, slots=True)
 class ModelReference:
     """What to load: see `slave_node.loading.load_executor`; ``parameters`` are start values that
-    hold unless the master gives others.
+    hold unless the master gives others, ``state_kind`` unless it asks for another.
     """
 
     model: str
@@ -48,6 +48,7 @@ class ModelReference:
     name: str
     parameters: Mapping[str, StartValue] = field(default_factory=dict)
     log_all: bool = False
+    state_kind: str = ""
 
 
 class Worker(Protocol):
@@ -222,6 +223,7 @@ def _main(pipe: Connection, reference: ModelReference, scratch: str) -> None:
             reference.name,
             Path(scratch),
             log_all=reference.log_all,
+            state_kind=reference.state_kind,
         )
     except DoublestepError as error:
         pipe.send_bytes(encode_error(error))

@@ -15,9 +15,10 @@ from random import Random
 from master_node.co_simulation import CoSimulation
 from master_node.configuration import System
 from master_node.observers import Attempt, RunEnd, RunStart
+from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
 from master_node.slave_group import SlaveGroup
-from master_node.slaves import Presence, claimed_slaves, describe
+from master_node.slaves import claimed_slaves, describe
 from master_node.system import resolve
 from protocol.bus import Bus
 from protocol.calls import Call, Reply
@@ -38,11 +39,12 @@ SHORT = SYSTEM.with_simulation(stop_time=0.08)
 STEP_TIMEOUT = 3.0
 ORPHAN_TIME = 5.0
 DISCOVERY_TIME = 5.0
-REQUEST_TIME = 4.0 * (STEP_TIMEOUT + 0.5) + 1.0
+RECONNECT_TIME = 4.0
+REQUEST_TIME = 30.0
 """No request takes longer than this, repetitions included [s]."""
 RUN_TIME = 1000.0
 """No run does; claims are allowed 90 s each [s]."""
-FREE_TIME = ORPHAN_TIME + 60.0
+FREE_TIME = RECONNECT_TIME + 2.0 * ORPHAN_TIME + 60.0
 """Then every slave is free again, whatever became of its master [s]."""
 
 
@@ -170,11 +172,13 @@ class _Schedule:
     workers: dict[str, _SlowWorker] = field(default_factory=dict)
     buses: dict[str, FaultyBus] = field(default_factory=dict)
     longest: float = 0.0
+    are_launched: bool = field(init=False)
 
     def __post_init__(self) -> None:
         self.random = Random(self.seed)
         self.clock = VirtualClock()
         self.network = Network(self.clock, self.random, NO_FAULTS)
+        self.are_launched = self.random.random() < 0.5
 
     def run(self) -> Outcome:
         """All of it; raises `BrokenLawError`."""
@@ -225,7 +229,16 @@ class _Schedule:
             bus.announce(alive_master(run))
             presence = Presence(bus, self.clock)
             keys = presence.wait(list(COUPLINGS), {}, _NoLauncher(), DISCOVERY_TIME)  # type: ignore[arg-type]
-            with claimed_slaves(bus, presence, keys, run=run, step_timeout=STEP_TIMEOUT) as remotes:
+            with claimed_slaves(
+                bus,
+                presence,
+                keys,
+                self._has_ended,
+                run=run,
+                step_timeout=STEP_TIMEOUT,
+                reconnect_time=RECONNECT_TIME,
+                clock=self.clock,
+            ) as remotes:
                 links = {n: _TimedLink(remote, self.clock) for n, remote in remotes.items()}
                 try:
                     coupled = resolve(system, describe(links))
@@ -237,6 +250,10 @@ class _Schedule:
         finally:
             bus.close()
         return observer.bits, None
+
+    def _has_ended(self, remote: RemoteSlave) -> bool:
+        """Known of a slave that was launched, never of one elsewhere."""
+        return self.are_launched and not self.buses[remote.key.name].is_alive
 
     def _check(self, bits: list[bytes], error: DoublestepError | None, taken: float) -> None:
         if taken > RUN_TIME:

@@ -84,6 +84,16 @@ class Sleeper(_Chassis):
         return list(super().derivatives(t, x, u))
 
 
+class Napper(Sleeper):
+    """A chassis that sleeps for ``nap`` seconds once, at ``sleeps_at``, where no ``bed`` is yet."""
+
+    def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
+        """The chassis' equations, once later."""
+        if self.bed and Path(self.bed).exists():
+            return list(_Chassis.derivatives(self, t, x, u))
+        return super().derivatives(t, x, u)
+
+
 class Filter(Model):
     """x' = u - x and y = x + gain u: its output follows its input at once, and late."""
 

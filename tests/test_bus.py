@@ -11,8 +11,9 @@ from queue import Empty, SimpleQueue
 import pytest
 
 from protocol.bus import Bus, InProcessBus
+from protocol.endpoints import Endpoints, host_of
 from protocol.errors import ConfigurationError, DeadlineError, DoublestepError, SlaveLostError
-from protocol.zenoh_bus import Endpoints, ZenohBus, host_of
+from protocol.zenoh_bus import ZenohBus
 
 BOUND = 10.0
 """No wait in these tests is longer [s]."""
@@ -410,6 +411,12 @@ def test_loopback_is_allowed(endpoint: str, host: str) -> None:
     assert host_of(endpoint) == host
 
 
+def test_tls_needs_certificates() -> None:
+    """An address alone does not make a connection secure."""
+    with pytest.raises(ConfigurationError, match=r"needs certificates; name their .* with --tls"):
+        Endpoints(connect=("tls/127.0.0.1:7447",), insecure=True)
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -423,7 +430,7 @@ def test_loopback_is_allowed(endpoint: str, host: str) -> None:
         "tcp/127.0.0.1:-1",
         "tcp/127.0.0.1:65536",
         "udp/127.0.0.1:7447",
-        "tls/127.0.0.1:7447",
+        "tls/127.0.0.1",
         "tcp/127.0.0.1:7447#iface=eth0",
         "tcp/127.0.0.1:7447?prio=1",
         "tcp//127.0.0.1:7447 ",

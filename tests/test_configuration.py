@@ -380,7 +380,7 @@ def test_a_missing_stop_time_may_come_later_but_must_come(tmp_path: Path) -> Non
             f"{SYSTEM}\nfactr = 1",
             "[[connections]] number 2: unknown key 'factr'; did you mean 'factor'?",
         ),
-        (bus("conect = []"), "[bus] unknown key 'conect'; did you mean 'connect'?"),
+        (bus("conect = []"), "[bus] unknown key 'conect'; did you mean 'connect' or"),
         (f"{SYSTEM}\n[results]\nvariable = []", "[results] unknown key 'variable'; did you mean"),
     ],
 )

@@ -7,6 +7,7 @@ is exact. The slaves are propagated exactly, and the whole car on that road is o
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -15,7 +16,8 @@ import numpy as np
 import pytest
 
 from master_node.numerics.extrapolation import POLYNOMIALS, InputPolynomial
-from protocol.slave import Capabilities, Slave
+from protocol.slave import Capabilities, InputDerivatives, Slave
+from slave_node.substeps import SubstepSlave, with_substeps
 from tests.quarter_car_case import (
     ALL,
     CHASSIS,
@@ -73,14 +75,15 @@ def observed_order(
     polynomial: InputPolynomial,
     chassis: Capabilities = SLOPES,
     wheel: Capabilities = SLOPES,
+    wrapped: Callable[[Slave], Slave] = lambda slave: slave,
     **simulation: Any,
 ) -> float:
     """The order with which the error at the end of the ramp falls from one H to its half."""
     errors = []
     for step_size in (RAMP / 200, RAMP / 400):
         slaves: dict[str, Slave] = {
-            "chassis": CHASSIS.slave(capabilities=chassis),
-            "wheel": RAMP_WHEEL.slave(AT_REST, capabilities=wheel),
+            "chassis": wrapped(CHASSIS.slave(capabilities=chassis)),
+            "wheel": wrapped(RAMP_WHEEL.slave(AT_REST, capabilities=wheel)),
         }
         system = car(
             estimator="none",
@@ -114,3 +117,25 @@ def test_a_slave_without_output_derivatives_costs_no_order(
     can: dict[str, Any] = {without: ALL}
     observed = observed_order(polynomial, **can)
     assert observed > polynomial.order + 0.75
+
+
+@pytest.mark.parametrize("sequence", ["jacobi", "gauss-seidel"])
+@pytest.mark.parametrize("polynomial", POLYNOMIALS, ids=str)
+def test_emulated_inputs_cost_no_order(polynomial: InputPolynomial, sequence: str) -> None:
+    """Slaves that take values only, in k + 1 substeps or more; with and without a look at the
+    derivatives of their outputs, which belong to the end of the step.
+    """
+    held = replace(SLOPES, can_interpolate_inputs=False)
+    observed = observed_order(polynomial, held, held, with_substeps, sequence=sequence)
+    assert observed > polynomial.order + 0.75
+
+
+def test_mean_values_alone_are_of_second_order() -> None:
+    """What the moments are for: one substep has the mean value, and the order is 2 for any k."""
+
+    def mean(slave: Slave) -> Slave:
+        return SubstepSlave(slave, InputDerivatives.EMULATED, 1)
+
+    held = replace(ALL, can_interpolate_inputs=False)
+    observed = observed_order(InputPolynomial(3), held, held, mean)
+    assert observed == pytest.approx(2.0, abs=0.25)

@@ -29,11 +29,11 @@ from protocol.calls import (
 )
 from protocol.errors import ModelError, SlaveError, StepRejectedError
 from protocol.signals import InputSignal
-from protocol.slave import Causality, StepStatus, VariableType
+from protocol.slave import Causality, Slave, StepStatus, VariableType
 from slave_node.executor import Executor
 from slave_node.fmu.archive import extract
 from slave_node.fmu.description import describe_fmu
-from slave_node.fmu.fmi2 import Fmi2Slave
+from slave_node.fmu.loading import load_fmu
 
 MODELS = ("chassis", "wheel", "wheel_force", "chassis_force")
 INPUTS = {
@@ -44,18 +44,18 @@ INPUTS = {
 }
 OUTPUTS = dict.fromkeys(MODELS, ("x", "v")) | {"wheel_force": ("F",)}
 
-Load = Callable[..., Fmi2Slave]
+Load = Callable[..., Slave]
 
 
 @pytest.fixture
 def load(fmu_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Load]:
     """``load(model)`` instantiates an FMU, by name or from another file; freed after the test."""
-    slaves: list[Fmi2Slave] = []
+    slaves: list[Slave] = []
 
-    def make(model: str | Path, *, log_all: bool = False) -> Fmi2Slave:
+    def make(model: str | Path, *, log_all: bool = False) -> Slave:
         fmu = fmu_dir / f"{model}.fmu" if isinstance(model, str) else model
         scratch = tmp_path_factory.mktemp("scratch")
-        slaves.append(Fmi2Slave(fmu, scratch, fmu.stem, log_all=log_all))
+        slaves.append(load_fmu(fmu, scratch, fmu.stem, log_all=log_all))
         return slaves[-1]
 
     yield make
@@ -64,13 +64,13 @@ def load(fmu_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lo
 
 
 def start(
-    slave: Fmi2Slave,
+    slave: Slave,
     *,
     inputs: tuple[str, ...] | None = None,
     outputs: tuple[str, ...] | None = None,
     tolerance: float | None = 1e-9,
     **start_values: float | int | bool | str,
-) -> Fmi2Slave:
+) -> Slave:
     """The slave at its first communication point, t = 0."""
     model = slave.description.model
     slave.initialize(
@@ -91,7 +91,7 @@ def polynomial(model: str, order: int) -> np.ndarray:
     return rows[: order + 1, : len(INPUTS[model])] * (15000.0 if model == "chassis_force" else 1.0)
 
 
-def march(slave: Fmi2Slave, begin: float, orders: tuple[int, ...] = (0, 3, 1, 2, 0)) -> bytes:
+def march(slave: Slave, begin: float, orders: tuple[int, ...] = (0, 3, 1, 2, 0)) -> bytes:
     """All that is seen over some steps with inputs of several orders, bit for bit."""
     seen, t = [], begin
     for i, order in enumerate(orders):
@@ -484,15 +484,18 @@ def changed(fmu_dir: Path, path: Path, *changes: tuple[str, str]) -> Path:
     return packed(path, {**entries, "modelDescription.xml": xml.encode()})
 
 
-FMI_3 = """<?xml version="1.0"?>
-<fmiModelDescription fmiVersion="3.0" modelName="m" instantiationToken="{0}">
+FMI_4 = """<?xml version="1.0"?>
+<fmiModelDescription fmiVersion="4.0" modelName="m" instantiationToken="{0}">
 <CoSimulation modelIdentifier="m"/><ModelVariables/><ModelStructure/>
 </fmiModelDescription>"""
-FMI_1 = """<?xml version="1.0"?>
+SCHEDULED = """<?xml version="1.0"?>
+<fmiModelDescription fmiVersion="3.0" modelName="m" instantiationToken="{0}">
+<ScheduledExecution modelIdentifier="m"/><ModelVariables/><ModelStructure/>
+</fmiModelDescription>"""
+MODEL_EXCHANGE_1 = """<?xml version="1.0"?>
 <fmiModelDescription fmiVersion="1.0" modelName="m" modelIdentifier="m" guid="{0}"
 numberOfContinuousStates="0" numberOfEventIndicators="0"><ModelVariables/>
-<Implementation><CoSimulation_StandAlone><Capabilities/></CoSimulation_StandAlone>
-</Implementation></fmiModelDescription>"""
+</fmiModelDescription>"""
 MODEL_EXCHANGE = """<?xml version="1.0"?>
 <fmiModelDescription fmiVersion="2.0" modelName="m" guid="{0}" numberOfEventIndicators="0">
 <ModelExchange modelIdentifier="m"/><ModelVariables/><ModelStructure/>
@@ -502,9 +505,9 @@ MODEL_EXCHANGE = """<?xml version="1.0"?>
 @pytest.mark.parametrize(
     ("xml", "message"),
     [
-        (FMI_1, "is an FMI 1.0 FMU; export it as FMI 2.0 co-simulation"),
-        (FMI_3, "is an FMI 3.0 FMU; export it as FMI 2.0 co-simulation"),
-        (MODEL_EXCHANGE, "is an FMU for model exchange only; export it as FMI 2.0 co-simulation"),
+        (FMI_4, "is an FMI 4.0 FMU; export it with FMI 3.0, 2.0 or 1.0"),
+        (SCHEDULED, "has neither co-simulation nor model exchange; export it as FMI 3.0"),
+        (MODEL_EXCHANGE_1, "is an FMU for model exchange of FMI 1.0; export it as co-simulation"),
         ("<fmiModelDescription", "modelDescription.xml cannot be read"),
         ("<other/>", "modelDescription.xml cannot be read"),
         ("", "modelDescription.xml cannot be read"),

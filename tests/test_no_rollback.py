@@ -6,7 +6,6 @@ import io
 import json
 import math
 import re
-import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -615,32 +614,19 @@ def test_the_summary_says_which_outputs_are_controlled_how(
 # ---- Real processes and FMUs --------------------------------------------------------------------
 
 
-def without_state(fmu: Path, target: Path) -> None:
-    """The FMU with canGetAndSetFMUstate = false in its model description."""
-    with zipfile.ZipFile(fmu) as source, zipfile.ZipFile(target, "w") as copy:
-        for entry in source.infolist():
-            data = source.read(entry)
-            if entry.filename == "modelDescription.xml":
-                for word in ("canGetAndSetFMUstate", "canSerializeFMUstate"):
-                    before, after = f'{word}="true"'.encode(), f'{word}="false"'.encode()
-                    assert before in data
-                    data = data.replace(before, after)
-            copy.writestr(entry, data)
-
-
 @pytest.mark.usefixtures("no_process_left")
 @pytest.mark.parametrize("without", [("wheel",), ("chassis", "wheel")])
 def test_fmus_without_saved_states_run_under_error_control(
     without: Collection[str], fmu_dir: Path, tmp_path: Path
 ) -> None:
     """Real FMUs in processes of their own, over Zenoh, and the same bits in this process."""
-    for name in ("chassis", "wheel"):
-        if name in without:
-            without_state(fmu_dir / f"{name}.fmu", tmp_path / f"{name}.fmu")
-        else:
-            (tmp_path / f"{name}.fmu").write_bytes((fmu_dir / f"{name}.fmu").read_bytes())
     options = {"order": "auto", "initial_step_size": None}
-    system = car("chassis.fmu", "wheel.fmu", base=tmp_path, **options)
+    system = car("chassis.fmu", "wheel.fmu", base=fmu_dir, **options)
+    slaves = {
+        name: settings.model_copy(update={"state": "none"}) if name in without else settings
+        for name, settings in system.slaves.items()
+    }
+    system = system.model_copy(update={"slaves": slaves})
     result = simulate(system, output=tmp_path / "results")
     assert global_errors(result).max() < 3e-4
     summary = json.loads((tmp_path / "results" / "summary.json").read_text())

@@ -18,6 +18,7 @@ import msgpack
 import psutil
 import pytest
 
+from protocol.administration import MAX_ORPHAN_TIME, Claim
 from protocol.bus import Bus, InProcessBus
 from protocol.calls import (
     Call,
@@ -37,6 +38,7 @@ from protocol.codec import (
     encode_program,
     encode_request,
 )
+from protocol.endpoints import Endpoints
 from protocol.errors import (
     ConfigurationError,
     DoublestepError,
@@ -59,7 +61,7 @@ from protocol.keys import (
     alive_slaves,
 )
 from protocol.slave import SlaveDescription
-from protocol.zenoh_bus import Endpoints, ZenohBus
+from protocol.zenoh_bus import ZenohBus
 from slave_node.node import SlaveNode
 from slave_node.worker import ModelReference, WorkerProcess
 
@@ -182,6 +184,7 @@ class Master:
     run: str = "run-1"
     pid: int = field(default_factory=os.getpid)
     host: str = field(default_factory=socket.gethostname)
+    orphan_time: float | None = None
     epoch: int = 0
     sequence: int = 0
 
@@ -191,7 +194,7 @@ class Master:
 
     def claim(self) -> Master:
         """Hold the slave."""
-        claim = {"run": self.run, "host": self.host, "pid": self.pid}
+        claim = Claim(self.run, self.host, self.pid, self.orphan_time).to_message()
         epoch = decode_map(self.ask(CLAIM, encode_map(claim)))["epoch"]
         assert isinstance(epoch, int)
         self.epoch, self.sequence = epoch, 0
@@ -644,6 +647,37 @@ def test_a_master_that_may_live_has_time_to_come_back(serve: Serve) -> None:
     vanish()
     wait_until(lambda: served.master().status()["state"] == "free")
     assert time.perf_counter() - begin > 0.25
+
+
+@in_process
+def test_a_master_says_how_long_it_is_to_be_waited_for(serve: Serve) -> None:
+    """The claim's orphan time is used in place of the slave's own, within a bound."""
+    served = serve(orphan_time=1000.0)
+    _, vanish = vanishing(served, "run-1", host="elsewhere", pid=1, orphan_time=0.3)
+    begin = time.perf_counter()
+    vanish()
+    wait_until(lambda: served.master().status()["state"] == "free")
+    assert time.perf_counter() - begin > 0.25
+    for wrong in (-1.0, MAX_ORPHAN_TIME * 1.01, float("nan"), float("inf"), "1", True, 10**400):
+        with pytest.raises(MalformedMessageError, match="orphan_time must be from 0 to 3600 s"):
+            Claim.from_message({"run": "r", "host": "h", "pid": 1, "orphan_time": wrong})
+    assert served.master().status()["state"] == "free"
+
+
+@in_process
+def test_a_master_that_came_back_is_waited_for_anew(serve: Serve) -> None:
+    """What is left of an earlier absence does not count."""
+    served = serve()
+    bus = served.bus
+    assert isinstance(bus, InProcessBus)
+    master, vanish = vanishing(served, "run-1", host="elsewhere", pid=1, orphan_time=0.6)
+    vanish()
+    time.sleep(0.4)
+    bus.announce(alive_master("run-1"))
+    bus.withdraw(alive_master("run-1"))
+    time.sleep(0.4)  # 0.8 s after the first absence began, 0.4 s after the second
+    assert master.status()["state"] == "held"
+    wait_until(lambda: master.status()["state"] == "free")
 
 
 @over_zenoh

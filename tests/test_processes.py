@@ -42,9 +42,11 @@ FOREVER = "stop_time = 1e6\nlargest_step_size = 1e-3\nsmallest_step_size = 1e-9\
 class Command:
     """A command in a process of its own; its standard error is read as it comes."""
 
-    def __init__(self, scratch: Path, module: str, *words: object) -> None:
+    def __init__(
+        self, scratch: Path, module: str, *words: object, prefix: Sequence[str] = ()
+    ) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", module, *map(str, words)],
+            [*prefix, sys.executable, "-m", module, *map(str, words)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -295,6 +297,39 @@ def test_the_same_bits_in_process_launched_and_by_hand(
         assert slave.wait() == 0
         assert "claimed by" in slave.text
         assert "released by" in slave.text
+
+
+def test_the_same_bits_whatever_the_version_of_fmi(
+    start: Start, tmp_path: Path, capability_dir: Path
+) -> None:
+    """Law: the halves of the quarter car in FMI 3.0 give the results of those in FMI 2.0."""
+    contents = []
+    for variant in ("no_derivatives", "fmi3"):
+        models = {name: capability_dir / f"{name}_{variant}.fmu" for name in ("chassis", "wheel")}
+        file = system_file(
+            tmp_path, **models, simulation="stop_time = 0.3\norder = 0\nderivative_points = 0\n"
+        )
+        output = tmp_path / variant
+        master = start("master_node", "run", file, "--no-plot", "--output", output)
+        assert master.wait() == 0, master.text
+        assert_summary(output, "completed")
+        contents.append([(output / name).read_bytes() for name in ("results.csv", "steps.csv")])
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize(
+    ("chassis", "wheel"),
+    [("chassis_me2", "wheel_me3"), ("chassis_fmi3_intermediate", "wheel_me2")],
+)
+def test_adapters_of_all_kinds_work_together(
+    start: Start, tmp_path: Path, capability_dir: Path, chassis: str, wheel: str
+) -> None:
+    """Model exchange and intermediate updates under polynomial inputs: the exact solution."""
+    file = system_file(tmp_path, capability_dir / f"{chassis}.fmu", capability_dir / f"{wheel}.fmu")
+    master = start("master_node", "run", file, "--no-plot", "--output", tmp_path / "results")
+    assert master.wait() == 0, master.text
+    result = assert_summary(tmp_path / "results", "completed")
+    assert max(result.steps["order"]) >= 2
 
 
 def test_simulate_launches_slaves_too(tmp_path: Path, fmu_dir: Path) -> None:

@@ -20,8 +20,9 @@ import psutil
 import pytest
 
 from protocol.codec import decode_map
+from protocol.endpoints import Endpoints
 from protocol.keys import STATUS, SlaveKey
-from protocol.zenoh_bus import Endpoints, ZenohBus
+from protocol.zenoh_bus import ZenohBus
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="uses named pipes and signals"),

@@ -44,11 +44,13 @@ class VirtualClock:
         self._number += 1
         heappush(self._events, (max(time, self._now), self._number, action))
 
-    def start(self, action: Callable[[], object]) -> None:
-        """Run ``action`` as a task from now on."""
-        task = greenlet.greenlet(action, self._hub)
-        self._tasks.append(task)
-        self.at(self._now, task.switch)
+    def start(self, action: Callable[[], object], name: str = "") -> VirtualTask:
+        """See `Clock`."""
+        task = VirtualTask(self)
+        made = greenlet.greenlet(lambda: task.run(action), self._hub)
+        self._tasks.append(made)
+        self.at(self._now, made.switch)
+        return task
 
     def later(self, seconds: float, action: Callable[[], None]) -> None:
         """See `Clock`."""
@@ -134,6 +136,28 @@ class Waiter:
         if not self._is_over:
             self._is_over = True
             self._task.switch()
+
+
+class VirtualTask:
+    """What `VirtualClock.start` started."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self._clock = clock
+        self._is_over = False
+        self._waiters: list[Waiter] = []
+
+    def run(self, action: Callable[[], object]) -> None:
+        """Do it, and tell those who wait for that."""
+        action()
+        self._is_over = True
+        for waiter in self._waiters:
+            waiter.wake()
+
+    def join(self, timeout: float) -> None:
+        """See `Task`."""
+        if not self._is_over:
+            self._waiters.append(Waiter(self._clock))
+            self._waiters[-1].wait(timeout)
 
 
 class VirtualLock:

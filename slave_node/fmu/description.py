@@ -3,94 +3,141 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 from fmpy import read_model_description
 
 from protocol.errors import ModelError
-from protocol.slave import (
-    Capabilities,
-    Causality,
-    InputDerivatives,
-    SlaveDescription,
-    StartValue,
-    StateKind,
-    Variable,
-    VariableType,
-)
+from protocol.slave import Causality, SlaveDescription, StartValue, StateKind, VariableType
 from slave_node.fmu.archive import extract
+from slave_node.fmu.interfaces import (
+    Interface,
+    default_step_size,
+    interface_1,
+    interface_2,
+    interface_3,
+)
+from slave_node.fmu.units import units
+from slave_node.fmu.variables import Place, Variables, read_variables
+
+_NO_STATE = "the FMU does not declare that it can save its state"
+
+
+@dataclass(frozen=True, slots=True)
+class FmuModel:
+    """An FMU that was extracted and read.
+
+    Attributes:
+        fmu: the file.
+        directory: where it was extracted.
+        description: for the master.
+        interface: the one that is used.
+        places: where each variable lies, by name.
+        structural_parameters: values that differ from the start values.
+        token: GUID or instantiation token, as the FMU wants to hear it.
+        log_categories: all.
+    """
+
+    fmu: Path
+    directory: Path
+    description: SlaveDescription
+    interface: Interface
+    places: Mapping[str, Place]
+    structural_parameters: Mapping[str, StartValue]
+    token: str
+    log_categories: tuple[str, ...]
 
 
 def describe_fmu(fmu: Path) -> SlaveDescription:
     """The description of an FMU file, without loading its binary.
 
     Raises:
-        ModelError: the file is missing, unsafe, or not an FMI 2.0 co-simulation FMU.
+        ModelError: the file is missing, unsafe, or not an FMU that can be run.
     """
     with TemporaryDirectory(prefix="doublestep-") as directory:
-        extract(fmu, Path(directory))
-        return describe(fmu, read_description(fmu, Path(directory)))
+        return read_fmu(fmu, Path(directory)).description
 
 
-def read_description(fmu: Path, directory: Path) -> Any:
-    """Fmpy's model description of the FMU extracted in ``directory``.
+def read_fmu(
+    fmu: Path, directory: Path, structural_parameters: Mapping[str, StartValue] | None = None
+) -> FmuModel:
+    """Extract an FMU and read its model description.
+
+    Args:
+        fmu: the file.
+        directory: an empty one to extract it into.
+        structural_parameters: values that hold instead of the start values.
 
     Raises:
-        ModelError: the XML cannot be read, or the FMU is not an FMI 2.0 co-simulation FMU.
+        ModelError: the file is missing or unsafe, the XML cannot be read, the version of FMI is
+            unknown, there is no interface that can be run, or no such structural parameter.
     """
+    extract(fmu, directory)
     try:
+        root = ElementTree.parse(directory / "modelDescription.xml").getroot()
+        read_interface = _version(root)
         model_description = read_model_description(str(directory), validate=False)
+        interface = read_interface(model_description, root)
+        variables = read_variables(model_description, root, structural_parameters or {})
+        return FmuModel(
+            fmu,
+            directory,
+            _description(fmu, model_description, root, interface, variables),
+            interface,
+            variables.places,
+            structural_parameters or {},
+            model_description.guid or "",
+            tuple(category.name for category in model_description.logCategories),
+        )
+    except ModelError as error:
+        raise ModelError(f"{fmu}: {error.cause}", remedy=error.remedy) from error
     except Exception as error:  # fmpy raises whatever its XML and type conversions raise
         raise ModelError(f"{fmu}: modelDescription.xml cannot be read: {error}") from error
-    version = str(model_description.fmiVersion)
-    if not version.startswith("2."):
-        raise ModelError(
-            f"{fmu}: is an FMI {version} FMU", remedy="export it as FMI 2.0 co-simulation"
-        )
-    if model_description.coSimulation is None:
-        raise ModelError(
-            f"{fmu}: is an FMU for model exchange only",
-            remedy="export it as FMI 2.0 co-simulation",
-        )
-    return model_description
 
 
-def describe(fmu: Path, model_description: Any) -> SlaveDescription:
-    """What a master needs to know about the FMU.
+_INTERFACES: Mapping[str, Callable[[Any, Element], Interface]] = {
+    "1": interface_1,
+    "2": interface_2,
+    "3": interface_3,
+}
 
-    Raises:
-        ModelError: a value in the model description is not of its type.
-    """
+
+def _version(root: Element) -> Callable[[Any, Element], Interface]:
+    version = root.attrib["fmiVersion"]
     try:
-        return _described(fmu, model_description)
-    except ValueError as error:
-        raise ModelError(f"{fmu}: modelDescription.xml cannot be read: {error}") from error
+        return _INTERFACES[version.split(".")[0]]
+    except KeyError:
+        raise ModelError(
+            f"is an FMI {version} FMU", remedy="export it with FMI 3.0, 2.0 or 1.0"
+        ) from None
 
 
-def _described(fmu: Path, model_description: Any) -> SlaveDescription:
-    slave = model_description.coSimulation
-    inputs = tuple(v.name for v in model_description.modelVariables if v.causality == "input")
-    feed_through = _feed_through(model_description, model_description.outputs, inputs)
+def _description(
+    fmu: Path, model_description: Any, root: Element, interface: Interface, variables: Variables
+) -> SlaveDescription:
+    saves_state = interface.capabilities.can_get_and_set_state
+    feed_through = _feed_through(model_description, root, variables, interface.version)
+    initial = _dependencies(model_description.initialUnknowns, variables)
     return SlaveDescription(
         model=model_description.modelName,
-        kind="FMI 2.0 co-simulation",
-        variables=tuple(_variable(v) for v in model_description.modelVariables),
-        capabilities=Capabilities(
-            can_get_and_set_state=bool(slave.canGetAndSetFMUstate),
-            can_serialize_state=bool(slave.canSerializeFMUstate),
-            can_interpolate_inputs=bool(slave.canInterpolateInputs),
-            max_output_derivative_order=int(slave.maxOutputDerivativeOrder or 0),
-            can_handle_variable_step_size=bool(slave.canHandleVariableCommunicationStepSize),
-        ),
-        feed_through=feed_through,
-        initial_feed_through=feed_through
-        | _feed_through(model_description, model_description.initialUnknowns, inputs, listed=True),
-        state_kind=StateKind.NATIVE if slave.canGetAndSetFMUstate else StateKind.NONE,
-        input_derivatives=(
-            InputDerivatives.NATIVE if slave.canInterpolateInputs else InputDerivatives.NONE
-        ),
+        kind=interface.kind,
+        variables=variables.scalars,
+        capabilities=interface.capabilities,
+        feed_through={name: inputs for name, inputs in feed_through.items() if inputs},
+        initial_feed_through={name: i for name, i in feed_through.items() if i} | initial,
+        state_kind=StateKind.NATIVE if saves_state else StateKind.NONE,
+        state_reason="" if saves_state else _NO_STATE,
+        input_derivatives=interface.input_derivatives,
+        fixed_step_size=interface.fixed_step_size,
+        default_step_size=default_step_size(model_description),
+        units=units(model_description),
+        remarks=tuple(_remarks(model_description, interface)),
         sha256=hashlib.sha256(fmu.read_bytes()).hexdigest(),
         guid=model_description.guid or "",
         generation_tool=model_description.generationTool or "",
@@ -98,52 +145,74 @@ def _described(fmu: Path, model_description: Any) -> SlaveDescription:
 
 
 def _feed_through(
-    model_description: Any, unknowns: Any, inputs: tuple[str, ...], *, listed: bool = False
+    model_description: Any, root: Element, variables: Variables, version: int
 ) -> dict[str, tuple[str, ...]]:
-    """Inputs on which each output depends; all of them where the FMU does not say.
-
-    ``listed``: only the outputs among ``unknowns``, for a list that need not have them all.
-    """
-    depends: dict[str, tuple[str, ...]] = {
-        v.name: inputs
+    """Inputs on which each output depends; all of them where the FMU does not say."""
+    inputs = _inputs(model_description.modelVariables, variables)
+    depends = {
+        name: inputs
         for v in model_description.modelVariables
-        if v.causality == "output" and not listed
+        if v.causality == "output"
+        for name in variables.elements[v.name]
     }
+    if version == 1:
+        return depends | _direct_dependencies(root)
+    return depends | _dependencies(model_description.outputs, variables, inputs)
+
+
+def _dependencies(
+    unknowns: Any, variables: Variables, all_inputs: tuple[str, ...] | None = None
+) -> dict[str, tuple[str, ...]]:
+    """Inputs on which the outputs among ``unknowns`` depend.
+
+    ``all_inputs``: what holds for an unknown without a list of dependencies; None: it then depends
+    on what it depends on otherwise.
+    """
+    depends: dict[str, tuple[str, ...]] = {}
     for unknown in unknowns:
-        if unknown.variable.causality == "output":
-            depends[unknown.variable.name] = (
-                inputs
-                if unknown.dependencies is None
-                else tuple(v.name for v in unknown.dependencies if v.causality == "input")
-            )
-    return {name: names for name, names in depends.items() if names or listed}
+        if unknown.variable.causality != "output":
+            continue
+        if unknown.dependencies is not None:
+            names: tuple[str, ...] | None = _inputs(unknown.dependencies, variables)
+        else:
+            names = all_inputs
+        if names is not None:
+            depends |= dict.fromkeys(variables.elements[unknown.variable.name], names)
+    return depends
 
 
-def _variable(variable: Any) -> Variable:
-    declared = variable.declaredType
-    unit = variable.unit or (declared.unit if declared else None)
-    nominal = variable.nominal or (declared.nominal if declared else None)
-    return Variable(
-        name=variable.name,
-        causality=Causality(variable.causality or "local"),
-        type=VariableType(variable.type),
-        variability=variable.variability or "continuous",
-        unit=unit or "",
-        start=_start(variable),
-        nominal=abs(float(nominal)) if nominal and float(nominal) != 0.0 else 1.0,
-        description=variable.description or "",
+def _inputs(declared: Any, variables: Variables) -> tuple[str, ...]:
+    """The scalar variables of the inputs among ``declared``."""
+    return tuple(
+        name for v in declared if v.causality == "input" for name in variables.elements[v.name]
     )
 
 
-def _start(variable: Any) -> StartValue | None:
-    if variable.start is None:
-        return None
-    match variable.type:
-        case "Real":
-            return float(variable.start)
-        case "Integer" | "Enumeration":
-            return int(variable.start)
-        case "Boolean":
-            return str(variable.start).lower() in ("true", "1")
-        case _:
-            return str(variable.start)
+def _direct_dependencies(root: Element) -> dict[str, tuple[str, ...]]:
+    """FMI 1.0: element DirectDependency."""
+    return {
+        variable.get("name", ""): tuple(name.text or "" for name in found.iterfind("Name"))
+        for variable in root.iterfind("./ModelVariables/ScalarVariable[@causality='output']")
+        if (found := variable.find("DirectDependency")) is not None
+    }
+
+
+def _remarks(model_description: Any, interface: Interface) -> list[str]:
+    """What of the FMU is not carried, and what it needs."""
+    remarks = [
+        f"clock {v.name} ({v.intervalVariability or 'without interval'}) is ignored"
+        for v in model_description.modelVariables
+        if v.type == VariableType.CLOCK
+    ]
+    remarks += [
+        f"{v.name} changes with a clock, which is ignored"
+        for v in model_description.modelVariables
+        if v.clocks and v.causality in (Causality.INPUT, Causality.OUTPUT)
+    ]
+    if interface.needs_execution_tool:
+        tool = model_description.generationTool or "the tool that exported it"
+        remarks.append(f"it needs {tool} on the host that runs it")
+    can_vary = interface.capabilities.can_handle_variable_step_size
+    if not can_vary and interface.fixed_step_size is None:
+        remarks.append("it takes one communication step size only, and does not say which")
+    return remarks

@@ -7,31 +7,29 @@ its arguments bound.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.signals import MAX_ORDER
+from protocol.signals import MAX_ORDER, FloatArray, InputSignal
+from protocol.slave import VariableType
+from slave_node.fmu.variables import Place
 
-VALUES_CALL = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p]
-"""Argument types of fmi2GetReal and fmi2SetReal."""
+VALUES_CALL = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p]
+"""Argument types of fmi2GetReal and fmi2SetReal, without the component."""
 
 DERIVATIVES_CALL = [*VALUES_CALL, ctypes.c_void_p]
 """Argument types of fmi2SetRealInputDerivatives and fmi2GetRealOutputDerivatives."""
 
 
-class ExchangeBuffer:
+class Buffer:
     """One direction: inputs to set or outputs to get.
 
     Args:
-        component: the FMU instance.
-        references: value references, shape (n,).
-        values: fmi2GetReal or fmi2SetReal with ``VALUES_CALL``.
-        derivatives: fmi2SetRealInputDerivatives or fmi2GetRealOutputDerivatives with
-            ``DERIVATIVES_CALL``.
+        n: number of variables.
 
     Attributes:
         size: n.
@@ -39,32 +37,224 @@ class ExchangeBuffer:
         first: ``first[r]`` is a view of the first r rows.
         transfer_values: transfers row 0; returns the FMU's status.
         transfer_derivatives: ``transfer_derivatives[k]()`` transfers rows 1 to k, k >= 1.
+        values_function, derivatives_function: what these call.
     """
 
     __slots__ = (
-        "_orders",
-        "_references",
+        "derivatives_function",
         "first",
         "rows",
         "size",
         "transfer_derivatives",
         "transfer_values",
+        "values_function",
     )
 
+    def __init__(self, n: int) -> None:
+        self.size = n
+        self.rows: FloatArray = np.zeros((MAX_ORDER + 1, n))
+        self.first = [self.rows[:r] for r in range(MAX_ORDER + 2)]
+        self.values_function = ""
+        self.derivatives_function = ""
+        self.transfer_values: Callable[[], int] = _nothing
+        self.transfer_derivatives: Sequence[Callable[[], int]] = [_nothing] * (MAX_ORDER + 1)
+
+
+class ExchangeBuffer(Buffer):
+    """With the functions of FMI 1.0 and 2.0.
+
+    Args:
+        references: value references, shape (n,).
+        values: name of and fmi2GetReal or fmi2SetReal with ``VALUES_CALL``, component bound.
+        derivatives: the same of fmi2SetRealInputDerivatives or fmi2GetRealOutputDerivatives with
+            ``DERIVATIVES_CALL``; None: nothing is transferred.
+    """
+
+    __slots__ = ("_orders", "_references")
+
     def __init__(
-        self, component: int, references: NDArray[np.uint32], values: Any, derivatives: Any
+        self,
+        references: NDArray[np.uint32],
+        values: tuple[str, Any],
+        derivatives: tuple[str, Any] | None,
     ) -> None:
         n = len(references)
-        orders = range(1, MAX_ORDER + 1)
-        self.size = n
-        self.rows = np.zeros((MAX_ORDER + 1, n))
-        self.first = [self.rows[:r] for r in range(MAX_ORDER + 2)]
+        super().__init__(n)
         self._references = np.tile(references, MAX_ORDER)
-        self._orders = np.repeat(np.array(orders, dtype=np.int32), n)
+        self._orders = np.repeat(np.arange(1, MAX_ORDER + 1, dtype=np.int32), n)
         of, address = self._references.ctypes.data, self.rows.ctypes.data
-        self.transfer_values: Callable[[], int] = partial(values, component, of, n, address)
+        self.values_function, get_or_set = values
+        self.transfer_values = partial(get_or_set, of, n, address)
+        if derivatives is None:
+            return
+        self.derivatives_function, get_or_set_derivatives = derivatives
         order_numbers, row_1 = self._orders.ctypes.data, address + n * self.rows.itemsize
-        self.transfer_derivatives: list[Callable[[], int]] = [
-            partial(derivatives, component, of, k * n, order_numbers, row_1)
+        self.transfer_derivatives = [
+            partial(get_or_set_derivatives, of, k * n, order_numbers, row_1)
             for k in range(MAX_ORDER + 1)
         ]
+
+
+class InputPolynomials:
+    """Inputs of an FMU that are set along their polynomials at times within a step.
+
+    Args:
+        given: holds the derivatives of all orders that are set, and zeros above.
+        within: transfers values of the same variables.
+    """
+
+    def __init__(self, given: Buffer, within: Buffer) -> None:
+        self._given = given
+        self._within = within
+        self.values_function = within.values_function
+
+    def set(self, rows: int, offset: float) -> int:
+        """Set the inputs of ``rows`` derivatives at ``offset`` [s] from where they were given."""
+        if self._within.size == 0:
+            return 0
+        self._within.rows[0] = InputSignal(self._given.first[rows]).at(offset)
+        return self._within.transfer_values()
+
+
+VALUES_CALL_3 = [*VALUES_CALL, ctypes.c_size_t]
+"""Argument types of fmi3GetFloat64 and its like, without the component."""
+
+DERIVATIVES_CALL_3 = [*DERIVATIVES_CALL, ctypes.c_size_t]
+"""Argument types of fmi3GetOutputDerivatives."""
+
+
+class _WholeVariables:
+    """Variables of one type with all their elements, of which some are columns of a buffer.
+
+    Args:
+        dtype: of the values.
+        places: of the scalar variables.
+        columns: where they stand in the buffer.
+    """
+
+    def __init__(self, dtype: Any, places: Sequence[Place], columns: Sequence[int]) -> None:
+        sizes = {place.reference: place.size for place in places}
+        begins = dict(zip(sizes, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
+        self.references = np.array(list(sizes), dtype=np.uint32)
+        self.values = np.zeros(sum(sizes.values()), dtype=dtype)
+        self.columns = np.array(columns)
+        self.elements = np.array([begins[place.reference] + place.element for place in places])
+
+    def call(self, function: Any) -> Callable[[], int]:
+        """A call of fmi3GetFloat64 or its like for them."""
+        return partial(
+            function,
+            self.references.ctypes.data,
+            len(self.references),
+            self.values.ctypes.data,
+            len(self.values),
+        )
+
+
+class ArrayExchangeBuffer(Buffer):
+    """With the functions of FMI 3.0: Float64 and Float32, elements of arrays.
+
+    Scalars of type Float64 go straight between buffer and FMU. Of an array all elements are
+    transferred; those that are no columns keep the values that `fill` got.
+
+    Args:
+        places: of the scalar variables.
+        function: gives the function of a full name and argument types, with the component bound.
+        sets: whether the FMU is to take the values (inputs) or to give them (outputs).
+        derivatives: whether outputs have them.
+    """
+
+    __slots__ = ("_kept", "_wholes")
+
+    def __init__(
+        self,
+        places: Sequence[Place],
+        function: Callable[[str, Sequence[Any]], Any],
+        *,
+        sets: bool,
+        derivatives: bool,
+    ) -> None:
+        n = len(places)
+        super().__init__(n)
+        verb = "fmi3Set" if sets else "fmi3Get"
+        self.values_function = f"{verb}Float64"
+        self.derivatives_function = "fmi3GetOutputDerivatives"
+        self._kept: list[Any] = []
+        self._wholes: list[tuple[_WholeVariables, Callable[[], int], Callable[[], int]]] = []
+        is_plain = all(p.type is VariableType.FLOAT64 and p.size == 1 for p in places)
+        if is_plain:
+            references = np.array([place.reference for place in places], dtype=np.uint32)
+            self._kept.append(references)
+            self.transfer_values = partial(
+                function(self.values_function, VALUES_CALL_3),
+                references.ctypes.data,
+                n,
+                self.rows.ctypes.data,
+                n,
+            )
+        else:
+            for kind, dtype in _FLOATS.items():
+                columns = [i for i, place in enumerate(places) if place.type is kind]
+                if columns:
+                    whole = _WholeVariables(dtype, [places[i] for i in columns], columns)
+                    get = function(f"fmi3Get{kind}", VALUES_CALL_3)
+                    transfer = function(f"{verb}{kind}", VALUES_CALL_3)
+                    self._wholes.append((whole, whole.call(get), whole.call(transfer)))
+            self.transfer_values = self._set if sets else self._get
+        if derivatives:
+            get_derivatives = function(self.derivatives_function, DERIVATIVES_CALL_3)
+            self.transfer_derivatives = self._derivatives(places, get_derivatives)
+
+    def fill(self) -> int:
+        """Get the elements of arrays that are no columns, for `transfer_values` to set again."""
+        return max((get() for _, get, _ in self._wholes), default=0)
+
+    def _get(self) -> int:
+        worst = 0
+        for whole, _, transfer in self._wholes:
+            worst = max(worst, transfer())
+            self.rows[0, whole.columns] = whole.values[whole.elements]
+        return worst
+
+    def _set(self) -> int:
+        worst = 0
+        for whole, _, transfer in self._wholes:
+            with np.errstate(over="ignore"):  # beyond Float32 it is infinite
+                whole.values[whole.elements] = self.rows[0, whole.columns]
+            worst = max(worst, transfer())
+        return worst
+
+    def _derivatives(self, places: Sequence[Place], function: Any) -> Sequence[Callable[[], int]]:
+        """All orders in one call; the values are of type Float64 whatever the variables are."""
+        whole = _WholeVariables(np.float64, places, range(len(places)))
+        n, size = len(whole.references), len(whole.values)
+        references = np.tile(whole.references, MAX_ORDER)
+        orders = np.repeat(np.arange(1, MAX_ORDER + 1, dtype=np.int32), n)
+        values = np.zeros((MAX_ORDER, size))
+        self._kept += [references, orders, values]
+        calls = [
+            partial(
+                function,
+                references.ctypes.data,
+                k * n,
+                orders.ctypes.data,
+                values.ctypes.data,
+                k * size,
+            )
+            for k in range(MAX_ORDER + 1)
+        ]
+
+        def transfer(k: int) -> int:
+            status: int = calls[k]()
+            self.rows[1 : k + 1] = values[:k, whole.elements]
+            return status
+
+        return [partial(transfer, k) for k in range(MAX_ORDER + 1)]
+
+
+def _nothing() -> int:
+    """For values that are not transferred."""
+    return 0
+
+
+_FLOATS = {VariableType.FLOAT64: np.float64, VariableType.FLOAT32: np.float32}

@@ -1,0 +1,164 @@
+"""What is wrong on the bus, and what to do about it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich.table import Table
+
+from master_node.plain_text import plain
+from master_node.survey import Participant, Timing, measure, survey
+from master_node.windows import Window
+from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
+from protocol.errors import SlaveLostError, VersionError
+from protocol.keys import MasterKey, SlaveKey
+
+_ROUNDS = 20
+_CLOCK_DIFFERENCE = 5.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that keeps a run from working.
+
+    Attributes:
+        where: an address or a participant.
+        cause, remedy: sentences.
+    """
+
+    where: str
+    cause: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was seen.
+
+    Attributes:
+        windows: where was looked.
+        timings: who was seen, with the times of status queries.
+        problems: that need something done.
+    """
+
+    windows: Sequence[Window]
+    timings: Sequence[tuple[Participant, Timing]]
+    problems: Sequence[Problem]
+
+    def tables(self) -> list[Table]:
+        """For people."""
+        ways = Table("address", "result", title="Connections", title_justify="left")
+        for window in self.windows:
+            result = "listening" if window.listens else "connected"
+            failure = window.failure
+            ways.add_row(window.endpoint, plain(result if failure is None else failure.cause))
+        there = Table(title="Participants", title_justify="left")
+        for column in ("name", "host / pid", "answers", "round trip", "clock", "state"):
+            there.add_column(column, no_wrap=True)
+        for participant, timing in self.timings:
+            status = participant.status
+            there.add_row(
+                plain(described(participant)),
+                plain("-" if status is None else f"{status.host} / {status.pid}"),
+                f"{len(timing.round_trips)} of {_ROUNDS}",
+                _milliseconds(timing.median),
+                _milliseconds(timing.clock_difference, signed=True),
+                plain(_state(participant)),
+            )
+        return [ways, there]
+
+
+def diagnose(windows: Sequence[Window]) -> Diagnosis:
+    """Look through all windows, ask everybody, and judge."""
+    problems = [
+        Problem(window.endpoint, window.failure.cause, window.failure.remedy)
+        for window in windows
+        if window.failure is not None
+    ]
+    participants = survey([window.bus for window in windows if window.bus is not None])
+    timings = [
+        (p, measure(p, _ROUNDS) if p.status is not None else Timing((), math.nan))
+        for p in participants
+    ]
+    for participant, timing in timings:
+        problems += _problems_of(participant, timing)
+    problems += _duplicates(participants)
+    if not any(isinstance(p.key, SlaveKey) for p in participants):
+        problems.append(
+            Problem(
+                "bus",
+                "no slave is in sight",
+                "start one with `slave-node serve MODEL`; slaves that connect to a master are seen "
+                "with --listen ADDRESS while that master does not run, or through a router",
+            )
+        )
+    return Diagnosis(windows, timings, problems)
+
+
+def described(participant: Participant) -> str:
+    """Kind and name."""
+    key = participant.key
+    if isinstance(key, SlaveKey):
+        return f"slave {key.name}"
+    return f"run {key.run}" if isinstance(key, MasterKey) else f"router {key.instance}"
+
+
+def _problems_of(participant: Participant, timing: Timing) -> list[Problem]:
+    where, failure = described(participant), participant.failure
+    if isinstance(failure, VersionError):
+        return [Problem(where, failure.cause, "install one version of Doublestep everywhere")]
+    if isinstance(failure, SlaveLostError):
+        return [
+            Problem(
+                where,
+                "it is there but does not let us ask",
+                "use a certificate of role master, and the same --tls authority everywhere",
+            )
+        ]
+    if failure is not None:
+        return [Problem(where, f"no usable answer: {failure.cause}", "see its log, or restart it")]
+    problems = []
+    if len(timing.round_trips) < _ROUNDS:
+        lost = _ROUNDS - len(timing.round_trips)
+        problems.append(
+            Problem(where, f"{lost} of {_ROUNDS} queries were not answered", "look at the network")
+        )
+    if timing.round_trips and not abs(timing.clock_difference) <= _CLOCK_DIFFERENCE:
+        problems.append(
+            Problem(
+                where,
+                f"its clock is {timing.clock_difference:+.1f} s off ours",
+                "set the clocks: certificates and logs depend on them, results do not",
+            )
+        )
+    return problems
+
+
+def _duplicates(participants: Sequence[Participant]) -> list[Problem]:
+    names = Counter(p.key.name for p in participants if isinstance(p.key, SlaveKey))
+    return [
+        Problem(f"slave {name}", f"there are {count} of this name", "end all but one of them")
+        for name, count in sorted(names.items())
+        if count > 1
+    ]
+
+
+def _state(participant: Participant) -> str:
+    match participant.status:
+        case SlaveStatus() as slave:
+            held = "free" if slave.holder is None else f"held by {slave.holder}"
+            return held if slave.worker == "alive" else f"{held}, worker {slave.worker}"
+        case MasterStatus() as master:
+            return f"runs {master.system}"
+        case RouterStatus() as router:
+            return router.endpoints
+    return "" if participant.failure is None else participant.failure.cause
+
+
+def _milliseconds(seconds: float, *, signed: bool = False) -> str:
+    if math.isnan(seconds):
+        return "-"
+    return f"{seconds * 1e3:{'+' if signed else ''}.1f} ms"

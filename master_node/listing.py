@@ -1,0 +1,69 @@
+"""What ``master-node list`` shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import datetime
+
+from rich.table import Table
+
+from master_node.plain_text import plain
+from master_node.survey import Participant
+from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
+from protocol.keys import MasterKey, SlaveKey
+
+
+def listing_tables(participants: Sequence[Participant]) -> list[Table]:
+    """Slaves, co-simulations and routers; no table for what there is none of."""
+    slaves = _table("Slaves", "name", "host", "model", "kind", "capabilities", "state", "since")
+    runs = _table("Co-simulations", "run", "host", "system", "slaves", "since")
+    routers = _table("Routers", "host", "addresses", "since")
+    silent = _table("No answer", "key", "cause")
+    for participant in participants:
+        match participant.status:
+            case SlaveStatus() as s:
+                held = "" if s.holder is None else f" by {s.holder.partition(' since')[0]}"
+                since = _clock(s.since if s.held_since is None else s.held_since)
+                row = (s.name, s.host, s.model, s.kind, s.capabilities, s.state + held, since)
+                _add(slaves, *row)
+            case MasterStatus() as m:
+                _add(runs, m.run, f"{m.host} / {m.pid}", m.system, m.slaves, _clock(m.since))
+            case RouterStatus() as r:
+                _add(routers, f"{r.host} / {r.pid}", r.endpoints, _clock(r.since))
+            case None:
+                _add(silent, participant.key.alive, participant.failure)
+    return [table for table in (slaves, runs, routers, silent) if table.row_count]
+
+
+def listing_data(participants: Sequence[Participant]) -> dict[str, list[dict[str, object]]]:
+    """The same as plain data, with times in seconds since 1970."""
+    data: dict[str, list[dict[str, object]]] = {
+        kind: [] for kind in ("slaves", "co_simulations", "routers", "silent")
+    }
+    for participant in participants:
+        if participant.status is None:
+            data["silent"].append({"key": participant.key.alive, "cause": str(participant.failure)})
+        elif isinstance(participant.key, SlaveKey):
+            data["slaves"].append(asdict(participant.status))
+        elif isinstance(participant.key, MasterKey):
+            data["co_simulations"].append(asdict(participant.status))
+        else:
+            data["routers"].append(asdict(participant.status))
+    return data
+
+
+def _table(title: str, *columns: str) -> Table:
+    return Table(*columns, title=title, title_justify="left")
+
+
+def _add(table: Table, *cells: object) -> None:
+    table.add_row(*map(plain, cells))
+
+
+def _clock(seconds: float) -> str:
+    """A time of day for people; whatever a slave sends is shown."""
+    try:
+        return datetime.fromtimestamp(seconds).astimezone().isoformat(" ", timespec="seconds")
+    except (OverflowError, ValueError, OSError):
+        return str(seconds)

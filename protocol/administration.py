@@ -1,0 +1,179 @@
+"""Messages beside the calls: the claim of a master, and what participants say of themselves.
+
+All travel as flat maps (`protocol.codec.encode_map`), which also hold the protocol version.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Final, Self
+
+from protocol.errors import MalformedMessageError
+from protocol.keys import check_name
+from protocol.slave import StartValue
+
+DEFAULT_ORPHAN_TIME: Final = 15.0
+"""How long a slave waits for a master that does not say how long [s]."""
+
+MAX_ORPHAN_TIME: Final = 3600.0
+"""A vanished master can keep a slave from others no longer than this [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A master takes a slave for its run.
+
+    Attributes:
+        run: id of the run.
+        host, pid: the master's process.
+        orphan_time: how long the slave waits for a master that vanished [s]; None: as it likes.
+    """
+
+    run: str
+    host: str
+    pid: int
+    orphan_time: float | None = None
+
+    def to_message(self) -> dict[str, StartValue | None]:
+        """As plain data."""
+        return {
+            "run": self.run,
+            "host": self.host,
+            "pid": self.pid,
+            "orphan_time": self.orphan_time,
+        }
+
+    @classmethod
+    def from_message(cls, message: Mapping[str, StartValue]) -> Self:
+        """The claim that ``to_message`` wrote.
+
+        Raises:
+            MalformedMessageError: a value is missing or has another type.
+            ConfigurationError: the id of the run is not valid.
+        """
+        run, host, pid = message.get("run"), message.get("host"), message.get("pid")
+        if type(run) is not str or type(host) is not str or type(pid) is not int:
+            raise MalformedMessageError(
+                "a claim must hold run and host as texts, and pid as a number"
+            )
+        return cls(check_name(run, "run id"), host, pid, _orphan_time(message.get("orphan_time")))
+
+
+def _orphan_time(value: StartValue | None) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        seconds = float(value) if abs(value) <= MAX_ORPHAN_TIME else math.inf
+        if 0.0 <= seconds <= MAX_ORPHAN_TIME:  # NaN is not
+            return seconds
+    raise MalformedMessageError(
+        f"orphan_time must be from 0 to {MAX_ORPHAN_TIME:g} s, not {value!r:.60}"
+    )
+
+
+class _Status:
+    """A flat map with a value for each field; texts, numbers and booleans, and None for nothing."""
+
+    __slots__ = ()
+
+    def to_message(self) -> dict[str, StartValue | None]:
+        """As plain data."""
+        return asdict(self)  # type: ignore[call-overload,no-any-return]  # of a dataclass below
+
+    @classmethod
+    def from_message(cls, message: Mapping[str, StartValue]) -> Self:
+        """The status that ``to_message`` wrote; values that it does not know are left out.
+
+        Raises:
+            MalformedMessageError: a value is missing or has another type.
+        """
+        values: dict[str, Any] = {}
+        for field in fields(cls):  # type: ignore[arg-type]  # of a dataclass below
+            value = message.get(field.name)
+            if type(value).__name__ not in str(field.type).replace("None", "NoneType").split(" | "):
+                raise MalformedMessageError(f"a status must hold {field.name} as {field.type}")
+            values[field.name] = value
+        return cls(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class SlaveStatus(_Status):
+    """What a slave says of itself. Times are seconds since 1970, by its own clock.
+
+    Attributes:
+        name, instance: its address.
+        host, pid: its process.
+        model, kind, sha256: as in its description.
+        capabilities: in short, for people.
+        state: ``free`` or ``held``.
+        busy: whether a request is being executed.
+        worker: ``alive`` or ``dead``.
+        holder: the master that holds it, for people; None: nobody.
+        run: id of that master's run.
+        held_since: when it was claimed [s].
+        since: when it began to serve [s].
+        time: when it said this [s]; only good for comparing clocks.
+        protocol_version: of its messages.
+    """
+
+    name: str
+    instance: str
+    host: str
+    pid: int
+    model: str
+    kind: str
+    sha256: str
+    capabilities: str
+    state: str
+    busy: bool
+    worker: str
+    holder: str | None
+    run: str | None
+    held_since: float | None
+    since: float
+    time: float
+    protocol_version: int
+
+
+@dataclass(frozen=True, slots=True)
+class MasterStatus(_Status):
+    """What a master says of its run. Times are seconds since 1970, by its own clock.
+
+    Attributes:
+        run: id of the run.
+        host, pid: its process.
+        system: the system file.
+        slaves: their names, with commas.
+        since: when it began [s].
+        time: when it said this [s].
+    """
+
+    run: str
+    host: str
+    pid: int
+    system: str
+    slaves: str
+    since: float
+    time: float
+
+
+@dataclass(frozen=True, slots=True)
+class RouterStatus(_Status):
+    """What a router says of itself. Times are seconds since 1970, by its own clock.
+
+    Attributes:
+        instance: its address.
+        host, pid: its process.
+        endpoints: where it listens and to what it connects, for people.
+        since: when it began [s].
+        time: when it said this [s].
+    """
+
+    instance: str
+    host: str
+    pid: int
+    endpoints: str
+    since: float
+    time: float

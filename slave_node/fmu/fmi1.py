@@ -1,0 +1,211 @@
+"""FMI 1.0 on fmpy's low-level layer, and its co-simulation FMUs as `Slave`.
+
+FMI 1.0 has neither saved states nor an initialization mode: what is set before fmiInitializeSlave
+is where it starts.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from fmpy import calloc, free
+from fmpy.fmi1 import (
+    FMICallException,
+    FMU1Slave,
+    fmi1CallbackAllocateMemoryTYPE,
+    fmi1CallbackFreeMemoryTYPE,
+    fmi1CallbackFunctions,
+)
+
+from protocol.calls import StepResult
+from protocol.errors import StepRejectedError
+from protocol.signals import FloatArray
+from protocol.slave import StartValue, StepStatus, VariableType
+from slave_node.fmu.description import FmuModel
+from slave_node.fmu.exchange import DERIVATIVES_CALL, VALUES_CALL, ExchangeBuffer
+from slave_node.fmu.fmu_slave import FmuSlave
+from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, reference_array
+from slave_node.fmu.log import LOGGER_1, add_proxy, instantiating, register, unregister
+from slave_node.fmu.values import ValueType
+
+_LAST_SUCCESSFUL_TIME = 2
+_NEW_STEP = 1
+
+
+class Fmi1Instance(FmuInstance):
+    """One instance of an FMI 1.0 FMU, see `FmuInstance`."""
+
+    prefix: ClassVar[str] = "fmi"
+    value_types: ClassVar[Mapping[VariableType, ValueType]] = {
+        VariableType.REAL: ValueType("Real", ctypes.c_double),
+        VariableType.INTEGER: ValueType("Integer", ctypes.c_int),
+        VariableType.ENUMERATION: ValueType("Integer", ctypes.c_int),
+        VariableType.BOOLEAN: ValueType("Boolean", ctypes.c_ubyte),
+        VariableType.STRING: ValueType("String", ctypes.c_char_p),
+    }
+
+    @property
+    def _fmpy_class(self) -> Callable[..., Any]:
+        return FMU1Slave  # type: ignore[no-any-return]
+
+    def _instantiate(self, *, log_all: bool) -> None:
+        callbacks = fmi1CallbackFunctions()
+        callbacks.logger = LOGGER_1
+        callbacks.allocateMemory = fmi1CallbackAllocateMemoryTYPE(calloc)
+        callbacks.freeMemory = fmi1CallbackFreeMemoryTYPE(free)
+        add_proxy(callbacks)
+        with instantiating(self.log):
+            self.fmu.instantiate(functions=callbacks, loggingOn=True)
+        if self.fmu.component is None:
+            raise RuntimeError("Failed to instantiate model")
+        register(self.fmu.component, self.log)
+        self.fmu.setDebugLogging(log_all)
+
+    def c_name(self, name: str) -> str:
+        """See `FmuInstance`: the names of FMI 1.0 begin with the model identifier."""
+        return f"{self.model.interface.model_identifier}_{name}"
+
+    def exchange(self, function: str, references: Any, arrays: Sequence[Any], values: int) -> None:
+        """See `FmuInstance`."""
+        del values
+        name = f"fmi{function}"
+        call = self.function(name, VALUES_CALL)
+        self.check(name, call(references.ctypes.data, len(references), *arrays))
+
+    def close(self) -> None:
+        """See `FmuInstance`."""
+        super().close()
+        unregister(self.log)
+
+
+class Fmi1Slave(FmuSlave):
+    """One instance of an FMI 1.0 co-simulation FMU.
+
+    In initialization mode outputs are start values. Where the FMU says none for one that is asked
+    for, it is initialized then, with the inputs that are set so far.
+
+    Args:
+        model: the FMU.
+        name: instance name.
+        log_all: let the FMU log debug messages, not only its errors.
+
+    Raises:
+        ModelError: the FMU cannot be loaded or instantiated here.
+    """
+
+    def __init__(self, model: FmuModel, name: str, *, log_all: bool = False) -> None:
+        self._fmi1 = Fmi1Instance(model, name, log_all=log_all)
+        super().__init__(self._fmi1)
+        self._do_step = self._fmi1.function(
+            "fmiDoStep", [ctypes.c_double, ctypes.c_double, ctypes.c_ubyte]
+        )
+        self._bind((), ())
+        self._times: tuple[float, float | None] = (0.0, None)
+        self._is_initialized = False
+        self._starts: dict[str, StartValue | None] = {}
+
+    def _bind(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
+        """Make the buffers for these inputs and outputs."""
+        instance = self._fmi1
+        places = instance.model.places
+
+        def buffer(names: Sequence[str], values: str, derivatives: str) -> ExchangeBuffer:
+            return ExchangeBuffer(
+                reference_array(instance.continuous_places(names)),
+                (values, instance.function(values, VALUES_CALL)),
+                (derivatives, instance.function(derivatives, DERIVATIVES_CALL)),
+            )
+
+        def signs(names: Sequence[str]) -> FloatArray:
+            return np.array([-1.0 if places[name].is_negated else 1.0 for name in names])
+
+        self._rows_set = 1
+        self._inputs = buffer(inputs, "fmiSetReal", "fmiSetRealInputDerivatives")
+        self._outputs = buffer(outputs, "fmiGetReal", "fmiGetRealOutputDerivatives")
+        self._input_signs, self._output_signs = signs(inputs), signs(outputs)
+        self._output_names = tuple(outputs)
+
+    def initialize(
+        self,
+        *,
+        start_time: float,
+        stop_time: float | None,
+        relative_tolerance: float | None,  # noqa: ARG002  FMI 1.0 has none for co-simulation
+        start_values: Mapping[str, StartValue],
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        discrete_inputs: Sequence[str] = (),
+        discrete_outputs: Sequence[str] = (),
+        early_return: bool = False,  # noqa: ARG002  it never does
+    ) -> None:
+        """See `Slave`."""
+        self._bind(inputs, outputs)
+        self._discrete_inputs = self._fmi1.discrete(discrete_inputs)
+        self._discrete_outputs = self._fmi1.discrete(discrete_outputs)
+        self._discrete_names = tuple(discrete_outputs)
+        self._times = (start_time, stop_time)
+        self._is_initialized = False
+        at_once, _ = self._fmi1.split_start_values(start_values)
+        self._fmi1.set_values(at_once)
+        self._starts = {v.name: v.start for v in self.description.variables} | dict(start_values)
+
+    def exit_initialization_mode(self) -> None:
+        """See `Slave`."""
+        if not self._is_initialized:
+            start_time, stop_time = self._times
+            self._fmi1.call(self._fmi1.fmu.initialize, tStart=start_time, stopTime=stop_time)
+            self._is_initialized = True
+
+    def set_inputs(self, derivatives: FloatArray) -> None:
+        """See `Slave`."""
+        super().set_inputs(derivatives * self._input_signs)
+
+    def get_outputs(self, order: int) -> FloatArray:
+        """See `Slave`."""
+        if not self._is_initialized:
+            starts = [self._starts[name] for name in self._output_names]
+            if order == 0 and None not in starts:
+                return np.array([starts], dtype=float)
+            self.exit_initialization_mode()
+        return super().get_outputs(order) * self._output_signs
+
+    def get_discrete_outputs(self) -> tuple[StartValue, ...]:
+        """See `Slave`."""
+        if not self._is_initialized:
+            starts = [self._starts[name] for name in self._discrete_names]
+            known = tuple(start for start in starts if start is not None)
+            if len(known) == len(starts):
+                return known
+            self.exit_initialization_mode()
+        return super().get_discrete_outputs()
+
+    def do_step(
+        self, communication_point: float, step_size: float, no_set_state_prior: bool
+    ) -> StepResult:
+        """See `Slave`. A step is always a new one: there is no way back."""
+        del no_set_state_prior
+        status = self._do_step(communication_point, step_size, _NEW_STEP)
+        if 0 <= status <= WARNING:
+            return StepResult(StepStatus.OK, communication_point + step_size)
+        if status == DISCARD:
+            return StepResult(StepStatus.DISCARD, self._last_successful_time())
+        if status == ERROR:
+            raise StepRejectedError(self._fmi1.log.explain("fmiDoStep returned fmiError"))
+        self._fmi1.check("fmiDoStep", status)
+        raise AssertionError
+
+    def _last_successful_time(self) -> float:
+        try:
+            return float(self._fmi1.fmu.getRealStatus(_LAST_SUCCESSFUL_TIME).value)
+        except FMICallException:
+            return math.nan
+
+    def reset(self) -> None:
+        """See `Slave`. What was never initialized stands where it was instantiated."""
+        if self._is_initialized:
+            super().reset()
+        self._is_initialized = False

@@ -1,0 +1,150 @@
+"""What FMUs have in common as slaves, whatever their version of FMI and their interface.
+
+Arrays go to and come from buffers that are made once, so that the hot path neither allocates in
+C types nor loops over variables in Python.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+
+from protocol.errors import SlaveError
+from protocol.signals import MAX_ORDER, FloatArray
+from protocol.slave import Slave, SlaveDescription, StartValue
+from slave_node.fmu.exchange import Buffer
+from slave_node.fmu.instance import FmuInstance
+
+
+class FmuSlave(Slave):
+    """One instance of an FMU.
+
+    A subclass makes the buffers and says how to initialize and to step.
+
+    Args:
+        instance: the FMU; the slave closes it.
+    """
+
+    _inputs: Buffer
+    _outputs: Buffer
+
+    def __init__(self, instance: FmuInstance) -> None:
+        self._instance = instance
+        self.description: SlaveDescription = instance.model.description
+        can = self.description.capabilities
+        self._saves_state = can.can_get_and_set_state
+        self._max_rows = MAX_ORDER + 1 if can.can_interpolate_inputs else 1
+        self._max_order = min(can.max_output_derivative_order, MAX_ORDER)
+        self._rows_set = 1
+        self._discrete_inputs = instance.discrete(())
+        self._discrete_outputs = instance.discrete(())
+
+    def set_inputs(self, derivatives: FloatArray) -> None:
+        """See `Slave`. A derivative once set stays set, so those above the order are zeroed."""
+        inputs = self._inputs
+        rows, columns = derivatives.shape
+        if columns != inputs.size or rows > self._max_rows:
+            raise SlaveError(
+                f"{rows} rows of {columns} input values; it takes up to {self._max_rows} rows of "
+                f"values for {inputs.size} inputs"
+            )
+        if columns == 0:
+            return
+        if rows < self._rows_set:
+            inputs.rows[rows:] = 0.0
+        else:
+            self._rows_set = rows
+        inputs.first[rows][...] = derivatives
+        status = inputs.transfer_values()
+        if status:
+            self._instance.check(inputs.values_function, status)
+        if self._rows_set > 1:
+            status = inputs.transfer_derivatives[self._rows_set - 1]()
+            if status:
+                self._instance.check(inputs.derivatives_function, status)
+
+    def get_outputs(self, order: int) -> FloatArray:
+        """See `Slave`."""
+        if not 0 <= order <= self._max_order:
+            raise SlaveError(
+                f"output derivatives of order {order} asked for; it gives orders up to "
+                f"{self._max_order}"
+            )
+        outputs = self._outputs
+        if outputs.size:
+            status = outputs.transfer_values()
+            if status:
+                self._instance.check(outputs.values_function, status)
+            if order:
+                status = outputs.transfer_derivatives[order]()
+                if status:
+                    self._instance.check(outputs.derivatives_function, status)
+        return outputs.first[order + 1].copy()
+
+    def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
+        """See `Slave`.
+
+        Raises:
+            SlaveError: a value is not of the type of its variable, or the FMU refused.
+        """
+        self._discrete_inputs.put(values, SlaveError)
+        self._discrete_inputs.send()
+
+    def get_discrete_outputs(self) -> tuple[StartValue, ...]:
+        """See `Slave`."""
+        return self._discrete_outputs.receive()
+
+    def get_state(self) -> object:
+        """See `Slave`."""
+        self._require_state()
+        instance = self._instance
+        state = ctypes.c_void_p()
+        status = instance.get_fmu_state(ctypes.byref(state))
+        if status:
+            instance.check(instance.state_functions[0], status)
+        return state
+
+    def set_state(self, state: object) -> None:
+        """See `Slave`."""
+        instance = self._instance
+        status = instance.set_fmu_state(state)
+        if status:
+            instance.check(instance.state_functions[1], status)
+
+    def free_state(self, state: object) -> None:
+        """See `Slave`."""
+        instance = self._instance
+        status = instance.free_fmu_state(ctypes.byref(state))  # type: ignore[arg-type]
+        if status:
+            instance.check(instance.state_functions[2], status)
+
+    def serialize_state(self, state: object) -> bytes:
+        """See `Slave`."""
+        self._require_serialization("serialize")
+        return bytes(self._instance.call(self._instance.fmu.serializeFMUState, state))
+
+    def deserialize_state(self, data: bytes) -> object:
+        """See `Slave`."""
+        self._require_serialization("deserialize")
+        state: object = self._instance.call(self._instance.fmu.deserializeFMUState, data)
+        return state
+
+    def _require_state(self) -> None:
+        if not self._saves_state:
+            raise SlaveError(f"the FMU {self.description.model} cannot save its state")
+
+    def _require_serialization(self, what: str) -> None:
+        if not self.description.capabilities.can_serialize_state:
+            raise SlaveError(f"the FMU {self.description.model} cannot {what} its state")
+
+    def terminate(self) -> None:
+        """See `Slave`."""
+        self._instance.call(self._instance.fmu.terminate)
+
+    def reset(self) -> None:
+        """See `Slave`."""
+        self._instance.call(self._instance.fmu.reset)
+
+    def close(self) -> None:
+        """See `Slave`."""
+        self._instance.close()

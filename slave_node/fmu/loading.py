@@ -1,0 +1,58 @@
+"""From an FMU file to the adapter for its version of FMI and its interface."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from protocol.errors import ModelError
+from protocol.slave import Slave, StartValue
+from slave_node.fmu.description import FmuModel, read_fmu
+from slave_node.fmu.fmi1 import Fmi1Slave
+from slave_node.fmu.fmi2 import Fmi2Slave
+from slave_node.fmu.fmi3 import Fmi3Slave
+
+
+def load_fmu(
+    fmu: Path,
+    directory: Path,
+    name: str,
+    *,
+    log_all: bool = False,
+    structural_parameters: Mapping[str, StartValue] | None = None,
+) -> Slave:
+    """The slave for an FMU.
+
+    Args:
+        fmu: the file.
+        directory: an empty directory to extract it into; the caller removes it.
+        name: instance name.
+        log_all: let the FMU log all its categories, not only its errors.
+        structural_parameters: values that hold instead of the start values (FMI 3.0).
+
+    Raises:
+        ModelError: the FMU cannot be read, loaded or instantiated here, or has no such structural
+            parameter.
+    """
+    model = read_fmu(fmu, directory, structural_parameters)
+    for remark in model.description.remarks:
+        logging.getLogger(__name__).warning("%s: %s", name, remark)
+    if model.interface.is_model_exchange:
+        return _model_exchange(model, name, log_all=log_all)
+    return _CO_SIMULATION[model.interface.version](model, name, log_all=log_all)
+
+
+_CO_SIMULATION: Mapping[int, Callable[..., Slave]] = {1: Fmi1Slave, 2: Fmi2Slave, 3: Fmi3Slave}
+
+
+def _model_exchange(model: FmuModel, name: str, *, log_all: bool) -> Slave:
+    try:
+        from slave_node.fmu import model_exchange  # noqa: PLC0415  others need no SUNDIALS
+    except OSError as error:
+        raise ModelError(
+            f"{model.fmu}: {model.interface.kind} needs SUNDIALS, which FMPy does not bring for "
+            f"this platform: {error}",
+            remedy="export it as co-simulation",
+        ) from error
+    return model_exchange.ADAPTERS[model.interface.version](model, name, log_all=log_all)

@@ -1,0 +1,38 @@
+"""Points in time that are the same but for rounding, or but for the error of a solver."""
+
+from __future__ import annotations
+
+import math
+
+_SLACK = 1e-4
+
+
+def meet(one: float, other: float) -> bool:
+    """Whether two times [s] differ by nothing but rounding."""
+    return abs(one - other) <= 4.0 * math.ulp(max(abs(one), abs(other)))
+
+
+class ReportedEvent:
+    """The event within a step that the master was told of last.
+
+    The master goes back and comes again with a step that ends there. Then the event can lie a bit
+    earlier or later, as the solver takes other steps: it is not to be told of once more.
+
+    Attributes:
+        time: of the event [s], NaN if there was none.
+        slack: how far it can have moved [s].
+    """
+
+    def __init__(self) -> None:
+        self.time = math.nan
+        self.slack = 0.0
+
+    def report(self, time: float, begin: float) -> None:
+        """The master is told of an event at ``time`` in a step from ``begin`` [s]."""
+        self.time = time
+        self.slack = _SLACK * (time - begin)
+
+    def is_expected(self, time: float, begin: float, end: float) -> bool:
+        """Whether ``time`` is that event, in a step that ends or begins with it."""
+        borders = meet(end, self.time) or meet(begin, self.time)
+        return meet(time, begin) or (borders and abs(time - self.time) <= self.slack)

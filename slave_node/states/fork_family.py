@@ -1,0 +1,118 @@
+"""All processes that hold one model by forking, as the slave sees them that started them."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from time import monotonic
+
+from protocol.errors import SlaveCrashedError
+from slave_node.states.channel import PROCESS, Channel
+from slave_node.states.fork_keeper import OBITUARY
+
+_IDLE_TIME = 1.0
+_OBITUARY_TIME = 1.0
+_END_TIME = 5.0
+_START = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+    "from slave_node.states.fork_keeper import main; main(*map(int, sys.argv[2:]))"
+)
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""A process with more cannot be forked."""
+
+
+class HolderFamily:
+    """The keeper and the holders below it; see ``fork_keeper.py``.
+
+    Attributes:
+        first: the channel to the first holder, which holds no model yet.
+        first_process: its process id.
+
+    Raises:
+        SlaveCrashedError: they do not come up.
+    """
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        self._obituaries, obituaries = os.pipe()
+        os.set_blocking(obituaries, False)
+        descriptors = (theirs.fileno(), obituaries)
+        try:
+            self._keeper = subprocess.Popen(
+                [sys.executable, "-c", _START, json.dumps(sys.path), *map(str, descriptors)],
+                stdin=subprocess.PIPE,
+                pass_fds=descriptors,
+                start_new_session=True,  # Ctrl-C is for who started us
+                env={**os.environ, **_ONE_THREAD},
+            )
+        except OSError as error:
+            ours.close()
+            os.close(self._obituaries)
+            raise SlaveCrashedError(f"no process for the model can be started: {error}") from error
+        finally:
+            theirs.close()
+            os.close(obituaries)
+        self._group = 0
+        self._is_closed = False
+        self.first = self.channel(ours)
+        try:
+            _, process = self.first.receive()
+        except (EOFError, OSError):
+            self.first.close()
+            self.close()
+            raise SlaveCrashedError("the process for the model did not come up") from None
+        (self.first_process,) = PROCESS.unpack(process)
+        self._group = self.first_process
+
+    def channel(self, connection: socket.socket) -> Channel:
+        """A channel to a holder whose waits end also when the keeper is gone."""
+        return Channel(connection, self._check_keeper, _IDLE_TIME)
+
+    def _check_keeper(self) -> None:
+        """Without a keeper nobody ends the holders but we."""
+        if self._keeper.poll() is not None:
+            self._kill()
+
+    def death(self, process: int) -> str:
+        """How a holder died whose channel is closed, in words."""
+        deadline = monotonic() + _OBITUARY_TIME
+        reader = select.poll()
+        reader.register(self._obituaries, select.POLLIN)
+        while (left := deadline - monotonic()) > 0.0 and reader.poll(left * 1e3):
+            record = os.read(self._obituaries, OBITUARY.size)
+            if len(record) < OBITUARY.size:  # nobody is left to write one
+                break
+            pid, status = OBITUARY.unpack(record)
+            if pid == process:
+                code = os.waitstatus_to_exitcode(status)
+                if code >= 0:
+                    return f"ended with exit code {code}"
+                return f"died by {signal.Signals(-code).name}"
+        return "is gone"
+
+    def close(self) -> None:
+        """End all of them, at once and in a bounded time. Idempotent."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        assert self._keeper.stdin is not None
+        self._keeper.stdin.close()
+        try:
+            self._keeper.wait(_END_TIME)
+        except subprocess.TimeoutExpired:
+            self._keeper.kill()
+            self._keeper.wait()
+        if self._keeper.returncode != 0:
+            self._kill()
+        os.close(self._obituaries)
+
+    def _kill(self) -> None:
+        if self._group:
+            with suppress(ProcessLookupError):
+                os.killpg(self._group, signal.SIGKILL)

@@ -1,0 +1,197 @@
+"""Connections that are not continuous, events within steps, units and arrays: with real FMUs."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from master_node import Result, System, load_system, simulate
+from protocol.errors import ConfigurationError
+from tests.conftest import EXAMPLES
+
+pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
+
+
+def clock_and_device(folder: Path, **simulation: Any) -> System:
+    """The system of the example, with the FMUs in ``folder``."""
+    system = load_system(EXAMPLES / "discrete" / "discrete.toml")
+    slaves = {name: {"model": str(folder / "all_types2.fmu")} for name in system.slaves}
+    return System(
+        simulation=system.simulation.model_dump(exclude_unset=True) | simulation,
+        slaves=slaves,
+        connections=system.connections,
+    )
+
+
+def switched_lag(times: np.ndarray) -> np.ndarray:
+    """The solution of y' = u - y, where u is 0 up to 0.25 s, then 1, and changes every 0.25 s."""
+    y, values, begin = 0.0, np.zeros_like(times), 0.0
+    for number in range(5):
+        u = float(number % 2)
+        inside = (times >= begin) & (times <= begin + 0.25)
+        values[inside] = u + (y - u) * np.exp(-(times[inside] - begin))
+        y = u + (y - u) * np.exp(-0.25)
+        begin += 0.25
+    return values
+
+
+@pytest.mark.parametrize("estimator", ["mod", "rich"])
+def test_discrete_outputs_switch_other_slaves(capability_dir: Path, estimator: str) -> None:
+    """What a change does to continuous variables is within the tolerance, and each is an event."""
+    result = simulate(clock_and_device(capability_dir), in_process=True, estimator=estimator)
+    error = np.abs(result["device.real_continuous_out"] - switched_lag(result.time))
+    assert error.max() < 1e-3
+    changes = np.flatnonzero(np.diff(result["clock.counter_out"]))
+    assert len(changes) == 4
+    assert result.summary["discontinuities"] == 4
+    assert result["clock.counter_out"].dtype == np.int64
+    assert result["clock.toggle_out"].dtype == np.bool_
+
+
+def test_values_are_held_and_handed_on(capability_dir: Path) -> None:
+    """At every point each output of the device belongs to the clock's value one point before."""
+    result = simulate(clock_and_device(capability_dir), in_process=True)
+    counter, toggle = result["clock.counter_out"], result["clock.toggle_out"]
+    assert (result["device.integer_out"][1:] == counter[:-1] + 1).all()
+    assert (result["device.boolean_out"][1:] == ~toggle[:-1]).all()
+    assert set(result["device.string_out"]) == {"got got "}
+    assert set(result["device.enumeration_out"]) == {3}
+
+
+def test_a_smaller_tolerance_sees_a_change_earlier(capability_dir: Path) -> None:
+    """The error that comes from handing changes over late falls with the tolerance."""
+    errors = []
+    for tolerance in (1e-2, 1e-3, 1e-4, 1e-5):
+        result = simulate(
+            clock_and_device(capability_dir),
+            in_process=True,
+            relative_tolerance=tolerance,
+            absolute_tolerance=tolerance,
+        )
+        exact = switched_lag(result.time)
+        errors.append(float(np.abs(result["device.real_continuous_out"] - exact).max()))
+    assert all(fine < coarse for coarse, fine in pairwise(errors))
+    assert errors[-1] < 1e-4
+
+
+def test_the_same_bits_over_zenoh(capability_dir: Path, tmp_path: Path) -> None:
+    """Values of all types come through the processes as they are."""
+    system = clock_and_device(capability_dir)
+    for name, in_process in (("here", True), ("there", False)):
+        simulate(system, in_process=in_process, output=tmp_path / name)
+    here, there = ((tmp_path / name / "results.csv").read_bytes() for name in ("here", "there"))
+    assert here == there
+
+
+def test_discrete_results_on_a_grid(capability_dir: Path) -> None:
+    """Between communication points a discrete value is what it was before."""
+    result = simulate(clock_and_device(capability_dir), in_process=True, output_interval=0.1)
+    assert result["clock.counter_out"].tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4]
+
+
+def test_a_fixed_step_hands_discrete_values_on(capability_dir: Path) -> None:
+    """Without an estimator too; the change is seen at the end of its step."""
+    result = simulate(
+        clock_and_device(capability_dir), in_process=True, estimator="none", initial_step_size=0.05
+    )
+    assert result["clock.counter_out"].tolist() == [int(i * 0.05 / 0.25 + 1e-9) for i in range(21)]
+    assert (result["device.integer_out"][1:] == result["clock.counter_out"][:-1] + 1).all()
+
+
+@pytest.mark.parametrize("in_process", [True, False])
+def test_an_early_return_is_an_event(capability_dir: Path, in_process: bool) -> None:
+    """A step that would pass over an event is repeated to end there; the event is where it is."""
+    system = System(
+        simulation={"stop_time": 1.0, "relative_tolerance": 1e-5, "absolute_tolerance": 1e-5},
+        slaves={"model": {"model": str(capability_dir / "event_mode3.fmu")}},
+    )
+    result = simulate(system, in_process=in_process)
+    for event in (0.35, 0.70):
+        assert np.abs(result.time - event).min() <= 2e-16
+    exact, level, begin = 1.0, 0.0, 0.0
+    at = {0.0: 1.0}
+    for event in (0.35, 0.7, 1.0):
+        exact = level + (exact - level) * np.exp(-(event - begin) / 0.5)
+        at[event] = exact
+        level, begin = level + 1.0, event
+    for event, y in at.items():
+        index = int(np.abs(result.time - event).argmin())
+        assert result["model.y"][index] == pytest.approx(y, abs=1e-7)
+    assert result.summary["discontinuities"] == 2
+    assert result["model.level"].max() == 2
+
+
+def lags(folder: Path, source: str, target: str, **connection: Any) -> System:
+    """Two lags of the same model family, the one driving the other."""
+    return System(
+        simulation={"stop_time": 1.0},
+        slaves={
+            "a": {"model": str(folder / f"{source}.fmu")},
+            "b": {"model": str(folder / f"{target}.fmu")},
+        },
+        connections=[{"from": "a.y", "to": "b.u", **connection}],
+    )
+
+
+def test_units_of_fmus_are_converted(capability_dir: Path) -> None:
+    """A lag driven in millimetres by one in metres does what it does driven in its own unit."""
+    folder = capability_dir
+    converted = simulate(lags(folder, "units_metres", "units_millimetres"), in_process=True)
+    given = lags(folder, "units_metres", "units_millimetres", factor=1e3)
+    assert (simulate(given, in_process=True)["b.y"] == converted["b.y"]).all()
+    as_it_is = lags(folder, "units_metres", "units_millimetres", ignore_units=True)
+    assert last(simulate(as_it_is, in_process=True), "b.y") != last(converted, "b.y")
+
+
+def test_units_of_other_dimensions_are_refused(capability_dir: Path) -> None:
+    """Both ends and both dimensions are named."""
+    system = System(
+        simulation={"stop_time": 1.0},
+        slaves={
+            "a": {"model": str(capability_dir / "units_metres.fmu")},
+            "b": {"model": str(capability_dir / "units_millimetres.fmu")},
+        },
+        connections=[{"from": "a.y", "to": "b.theta_in"}],
+    )
+    with pytest.raises(ConfigurationError, match=r"a\.y and b\.theta_in .* is m, .* is K"):
+        simulate(system, in_process=True)
+
+
+def arrays(folder: Path, **slave: Any) -> System:
+    """Two FMUs whose arrays are connected."""
+    model = {"model": str(folder / "all_types3.fmu"), **slave}
+    return System(
+        simulation={"stop_time": 1.0},
+        slaves={"a": model, "b": model},
+        connections=[("a.matrix_out", "b.matrix_in"), ("a.vector_out", "b.vector_in")],
+    )
+
+
+def last(result: Result, name: str) -> float:
+    """The last value of a variable."""
+    return float(result[name][-1])
+
+
+def test_arrays_are_connected_by_their_names(capability_dir: Path) -> None:
+    """Each element goes to the element of the same indices; start values come in rows."""
+    system = arrays(capability_dir, parameters={"matrix_in": ((1, 2, 3), (4, 5, 6))})
+    result = simulate(system, in_process=True, estimator="none", initial_step_size=0.1)
+    for row in (1, 2):
+        for column in (1, 2, 3):
+            element = f"matrix_out[{row},{column}]"
+            start = 3 * (row - 1) + column
+            assert last(result, f"a.{element}") == 2.0 * start
+            assert last(result, f"b.{element}") == 4.0 * start
+
+
+def test_structural_parameters_size_arrays(capability_dir: Path) -> None:
+    """They are set in configuration mode, before anything else is known of the slave."""
+    system = arrays(capability_dir, parameters={"n": 5})
+    result = simulate(system, in_process=True, estimator="none", initial_step_size=0.1)
+    assert "a.vector_out[5]" in result.names
+    assert "a.vector_out[6]" not in result.names
+    assert last(result, "b.vector_out[5]") == 2.0
