@@ -169,6 +169,7 @@ class CoSimulation:
                 outputs.d,
                 output_control(self.coupled, self.system),
                 {part.name: part.description.state_kind for part in self.coupled.parts},
+                self.group.statistics,
             )
         )
         begin = perf_counter()

@@ -58,6 +58,12 @@ def _pattern(value: str) -> str:
     return value
 
 
+def _sha256(value: str) -> str:
+    if len(value) != 64 or set(value.lower()) - set("0123456789abcdef"):
+        raise ValueError("write 64 hexadecimal digits")
+    return value.lower()
+
+
 def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:
     if not value:
         raise ValueError("must not be empty")
@@ -299,6 +305,7 @@ class SlaveSettings(_Table):
     Attributes:
         model: an ``.fmu`` file, ``package.module:Class`` or ``file.py:Class``, relative to the
             system file; without it the slave is looked for on the bus, by name.
+        sha256: that the model's file must have, hexadecimal.
         parameters: start values of parameters and other variables, by name.
         relative_tolerance, absolute_tolerance: for this slave's outputs.
         tolerances: for single outputs, by name.
@@ -315,6 +322,7 @@ class SlaveSettings(_Table):
     """
 
     model: StrictStr | None = None
+    sha256: Annotated[StrictStr, AfterValidator(_sha256)] | None = None
     parameters: Mapping[str, Value] = Field(default_factory=dict)
     relative_tolerance: NotNegative | None = None
     absolute_tolerance: Positive | None = None

@@ -156,7 +156,9 @@ class Presence:
             names = {remote.key.name for remote in absent}
             if back := sorted(warned - names):
                 away = max(now - since[name] for name in back)
-                log.info("the connection to %s is back after %.1f s", ", ".join(back), away)
+                names_back = ", ".join(back)
+                about = {"slave": names_back}
+                log.info("the connection to %s is back after %.1f s", names_back, away, extra=about)
             since = {name: since.get(name, now) for name in names}
             warned &= names
             for remote in absent:
@@ -176,6 +178,7 @@ class Presence:
                     "the connection to %s was lost; waiting for it, %g s at most (reconnect_time)",
                     ", ".join(sorted(late)),
                     reconnect_time,
+                    extra={"slave": ", ".join(sorted(late))},
                 )
                 warned |= late
             with self._changed:

@@ -98,6 +98,11 @@ class RemoteSlave:
         """True when its process was on this host and is no more; False: it may live."""
         return has_ended(self._host, self._pid)
 
+    @property
+    def request(self) -> str:
+        """See `SlaveLink`."""
+        return f"{self._epoch}:{self._sequence}"
+
     def start(self, calls: Sequence[Call]) -> None:
         """See `SlaveLink`."""
         self._sequence += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from master_node.configuration import InputSettings, System
 from master_node.configure_slaves import configure
 from master_node.examinations import as_plain_data
 from master_node.input_loading import load_signals
+from master_node.model_hashes import check_hashes
 from master_node.observers import Observer, Observers
 from master_node.preparation import prepare
 from master_node.results import (
@@ -27,6 +28,7 @@ from master_node.slave_group import SlaveGroup
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
 from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.system import resolve
+from master_node.trace import TraceWriter
 from protocol.slave import SlaveDescription
 
 log = logging.getLogger("master_node")
@@ -39,6 +41,7 @@ def simulate(
     in_process: bool = False,
     launch: bool = True,
     observers: Sequence[Observer] = (),
+    trace: Path | str | None = None,
     **simulation: Any,
 ) -> Result:
     """Run a system and give its result.
@@ -49,6 +52,7 @@ def simulate(
         in_process: run the slaves in this process, without a bus.
         launch: start slaves that have a model; False: find all of them on the bus.
         observers: are told of everything that happens.
+        trace: file for a trace of all requests, see ``docs/observability.md``; None: none.
         **simulation: settings that override ``system.simulation``, such as ``stop_time=4.0``.
 
     Raises:
@@ -64,6 +68,7 @@ def simulate(
         launch=launch,
         observers=observers,
         recording=recording,
+        trace=None if trace is None else Path(trace),
     )
     return recording.result()
 
@@ -76,6 +81,7 @@ def run(
     launch: bool = True,
     observers: Sequence[Observer] = (),
     recording: Recording | None = None,
+    trace: Path | None = None,
 ) -> None:
     """Run a system; raises as `simulate`.
 
@@ -86,20 +92,26 @@ def run(
         launch: start slaves that have a model; False: find all of them on the bus.
         observers: are told of everything that happens.
         recording: is told of the results that the system asks for, as the files are.
+        trace: file for a trace of all requests; None: none.
     """
     settings = settings_of(system, {})
     check_step_sizes(system)
     signals = load_signals(system)
     if directory is not None:
         ResultsWriter(directory, settings).prepare()
-    with _slaves(system, directory, in_process=in_process, launch=launch) as slaves:
+    with ExitStack() as stack:
+        traces = [] if trace is None else [stack.enter_context(closing(TraceWriter(trace)))]
+        slaves = stack.enter_context(
+            _slaves(system, directory, in_process=in_process, launch=launch)
+        )
+        check_hashes(system, slaves.descriptions)
         descriptions = configure(slaves.links, system, slaves.descriptions)
         system = with_fixed_steps(system, descriptions)
         check_step_sizes(system)
         warnings = check_capabilities(resolve(system, descriptions, signals), system)
         for warning in warnings:
             log.warning("%s", warning)
-        group = SlaveGroup(slaves.links)
+        group = SlaveGroup(slaves.links, traces)
         prepared = prepare(group, system, descriptions, signals)
         coupled = resolve(prepared.system, prepared.descriptions, signals)
         for warning in check_capabilities(coupled, prepared.system):
@@ -115,7 +127,7 @@ def run(
             settings["examinations"] = as_plain_data(prepared.examinations)
             keepers.append(ResultsWriter(directory, settings))
         selected = SelectedResults(Observers(keepers), wanted.variables, wanted.every)
-        observer = Observers([*observers, selected])
+        observer = Observers([*observers, *traces, selected])
         CoSimulation(group, coupled, prepared.system, observer, prepared.outputs).run()
 
 

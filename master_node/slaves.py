@@ -32,6 +32,7 @@ from protocol.errors import (
     SlaveLostError,
 )
 from protocol.keys import SlaveKey
+from protocol.logs import add_log_fields
 from protocol.slave import SlaveDescription
 from protocol.zenoh_bus import ZenohBus
 
@@ -113,6 +114,7 @@ def slaves_on_bus(system: System, log_directory: Path, *, launch: bool = True) -
         bus = ZenohBus(endpoints, timeout=system.bus.discovery_timeout)
         stack.callback(bus.close)
         run = token_hex(4)
+        add_log_fields(run=run)
         announce_run(bus, run, system)
         launcher = stack.enter_context(
             Launcher(_connection(endpoints, private), log_directory, pin=system.bus.pin)

@@ -132,18 +132,20 @@ class SlaveNode:
                 again = self._claims.admit(epoch, sequence)
                 if again is not None:
                     return again
-                reply = self._run(program)
+                reply = self._run(program, epoch, sequence)
                 self._claims.record(sequence, reply)
             except DoublestepError as error:
                 return encode_error(error)
             return reply
 
-    def _run(self, program: bytes) -> bytes:
+    def _run(self, program: bytes, epoch: int = 0, sequence: int = 0) -> bytes:
+        """Execute a program, that of a request or, without a number, one of the node's own."""
         try:
             return self._worker.execute(program)
         except SlaveCrashedError as error:
             if self._worker_alive:
-                log.error("%s", error)
+                request = f"{epoch}:{sequence}" if sequence else ""
+                log.error("%s", error, extra={"request": request, **_about(self._claims.holder)})
             self._worker_alive = False
             return encode_error(error)
 
@@ -192,7 +194,7 @@ class SlaveNode:
                     self._renew()
                 epoch = self._claims.claim(holder)
             if new:
-                log.info("claimed by %s", holder)
+                log.info("claimed by %s", holder, extra=_about(holder))
                 self._look_after(epoch, holder.orphan_time)  # a claim may arrive after its run
         except DoublestepError as error:
             log.warning("claim refused: %s", error)
@@ -209,7 +211,7 @@ class SlaveNode:
             with self._running:
                 holder = self._claims.holder
                 self._claims.release(epoch)
-                log.info("released by %s", holder)
+                log.info("released by %s", holder, extra=_about(holder))
                 self._reset()
         except DoublestepError as error:
             return encode_error_map(error.located(slave=self._key.name, phase=RELEASE))
@@ -262,9 +264,9 @@ class SlaveNode:
             return
         self._changes_of_master += 1
         if alive:
-            log.info("the master is there: %s", holder)
+            log.info("the master is there: %s", holder, extra=_about(holder))
             return
-        log.warning("the master is gone: %s", holder)
+        log.warning("the master is gone: %s", holder, extra=_about(holder))
         ended = has_ended(holder.host, holder.pid)
         self._look_after(self._claims.epoch, 0.0 if ended else holder.orphan_time)
 
@@ -286,7 +288,7 @@ class SlaveNode:
                 self._end_worker("its master is gone")
             with self._running:
                 self._claims.release(epoch)
-                log.warning("reset; free for another master")
+                log.warning("reset; free for another master", extra=_about(holder))
                 self._reset()
         except (SequenceError, SlaveLostError) as error:
             log.info("not reset: %s", error)  # released meanwhile, or the node is ending
@@ -302,6 +304,11 @@ def _capabilities(description: SlaveDescription) -> str:
         "output derivatives": can.max_output_derivative_order > 0,
     }
     return ", ".join(name for name, has in known.items() if has)
+
+
+def _about(holder: Holder | None) -> dict[str, str]:
+    """Whose run a message of the log is about."""
+    return {} if holder is None else {"run": holder.run}
 
 
 def _epoch(message: Mapping[str, StartValue]) -> int:

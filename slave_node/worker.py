@@ -30,6 +30,7 @@ from protocol.errors import (
     MalformedMessageError,
     SlaveCrashedError,
 )
+from protocol.logs import LogFormat, configure_logs
 from protocol.slave import CallExecutor, SlaveDescription, StartValue
 
 _END = b""
@@ -40,7 +41,8 @@ _PR_SET_PDEATHSIG = 1
 @dataclass(frozen=True, slots=True)
 class ModelReference:
     """What to load: see `slave_node.loading.load_executor`; ``parameters`` are start values that
-    hold unless the master gives others, ``state_kind`` unless it asks for another.
+    hold unless the master gives others, ``state_kind`` unless it asks for another; ``log_format``
+    is that of the worker's messages.
     """
 
     model: str
@@ -49,6 +51,7 @@ class ModelReference:
     parameters: Mapping[str, StartValue] = field(default_factory=dict)
     log_all: bool = False
     state_kind: str = ""
+    log_format: LogFormat = LogFormat.TEXT
 
 
 class Worker(Protocol):
@@ -214,6 +217,9 @@ def _main(pipe: Connection, reference: ModelReference, scratch: str) -> None:
     _die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    configure_logs(
+        reference.log_format, f"%(asctime)s {reference.name}: %(message)s", slave=reference.name
+    )
     try:
         from slave_node.loading import load_executor  # noqa: PLC0415  after the process is set up
 
