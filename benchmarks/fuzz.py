@@ -6,7 +6,6 @@ after which something did not hold, and says which one it was: ``--first`` repea
 
 import faulthandler
 import logging
-import resource
 from argparse import ArgumentParser
 from collections import Counter
 from time import perf_counter
@@ -64,4 +63,6 @@ def main(words: list[str]) -> None:
 
 def _peak_memory() -> float:
     """Of this process [MB]."""
+    import resource  # noqa: PLC0415  POSIX only, and this is the only benchmark that needs it
+
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
