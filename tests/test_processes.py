@@ -94,8 +94,9 @@ class Command:
 
     @property
     def killed(self) -> bool:
-        """Whether SIGKILL ended it."""
-        return self._process.poll() == -signal.SIGKILL
+        """Whether a signal ended it that it could not do anything about."""
+        code = self._process.poll()
+        return code is not None and code < 0
 
     def close(self) -> None:
         """End it, whatever it does."""
