@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from master_node.observers import Observer
 from protocol.credentials import Credentials, Role
 from protocol.endpoints import LOOPBACK
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
@@ -26,6 +25,8 @@ from protocol.logs import LogFormat, about, configure_logs, logs_json
 if TYPE_CHECKING:  # each command imports what it needs
     from master_node.study.directory import StudyDirectory
     from master_node.study.runner import Runner
+if TYPE_CHECKING:
+    from master_node.observers import Observer
 
 app = typer.Typer(
     help="Co-simulation master with error-controlled communication step sizes.",
