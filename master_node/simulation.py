@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from master_node.agents import Uploading
+from master_node.agent_models import Uploading
 from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.configuration import InputSettings, System
 from master_node.configure_slaves import configure
