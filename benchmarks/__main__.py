@@ -2,7 +2,16 @@
 
 import sys
 
-from benchmarks import emulated_inputs, in_process, memory, over_zenoh, saved_states, tls
+from benchmarks import (
+    emulated_inputs,
+    in_process,
+    many_variables,
+    memory,
+    over_zenoh,
+    recovery,
+    saved_states,
+    tls,
+)
 
 TABLES = {
     "over_zenoh": (
@@ -29,6 +38,16 @@ TABLES = {
         "States saved by forking and natively",
         ("what", "fork", "native", "ratio"),
         saved_states.run,
+    ),
+    "many_variables": (
+        "Attempted double step of two slaves with many connected variables",
+        ("configuration", "5 000 variables", "10 variables", "ratio"),
+        many_variables.run,
+    ),
+    "recovery": (
+        "A slave process is killed in mid step",
+        ("process", "noticed after", "the next double step is done after"),
+        recovery.run,
     ),
     "memory": (
         "Resident memory over a million attempted double steps",

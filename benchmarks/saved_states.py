@@ -61,7 +61,7 @@ def _attempt(kind: str, estimator: str, *, in_process: bool) -> float:
         tempfile.TemporaryDirectory() as logs,
         slaves_in_process(car) if in_process else slaves_on_bus(car, Path(logs)) as slaves,
     ):
-        coupled = resolve(car, configure(slaves.links, car))
+        coupled = resolve(car, configure(slaves.links, car, slaves.descriptions))
         CoSimulation(SlaveGroup(slaves.links), coupled, car, timing).run()
     return timing.medians()[0]
 

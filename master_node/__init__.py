@@ -11,7 +11,7 @@ from master_node.configuration import (
     load_system,
 )
 from master_node.results import Result
-from master_node.simulation import simulate
+from master_node.simulation import resume, simulate
 from master_node.system_files import open_system
 
 __all__ = [
@@ -25,5 +25,6 @@ __all__ = [
     "System",
     "load_system",
     "open_system",
+    "resume",
     "simulate",
 ]

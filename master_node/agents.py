@@ -192,6 +192,11 @@ class Agents:
         self._ended[name] = error
         return error
 
+    def how_ended(self, name: str) -> str:
+        """See `Starter`."""
+        error = self.ended(name)
+        return "" if error is None else error.cause
+
     def wait_ended(self, name: str, timeout: float) -> DoublestepError | None:
         """See `Starter`."""
         if name not in self._placed:

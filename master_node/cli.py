@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import logging
+import os
 import signal
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from protocol.credentials import Credentials, Role
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
+
+if TYPE_CHECKING:  # each command imports what it needs
+    from master_node.study.directory import StudyDirectory
+    from master_node.study.runner import Runner
 
 app = typer.Typer(
     help="Co-simulation master with error-controlled communication step sizes.",
@@ -25,6 +33,8 @@ app = typer.Typer(
 )
 
 log = logging.getLogger("master_node")
+
+_END_TIME = 5.0
 
 Tls = Annotated[
     Path | None,
@@ -86,6 +96,9 @@ def run(  # noqa: PLR0917  options of the command line
     step_size: Annotated[
         float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
     ] = None,
+    case: Annotated[
+        Path | None, typer.Option(help="Parameters of a run of a study, its case.toml.")
+    ] = None,
     state: Annotated[
         str | None,
         typer.Option(help="How all slaves save their states: native, fork, replay or none."),
@@ -120,19 +133,23 @@ def run(  # noqa: PLR0917  options of the command line
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
+    stay_with_parent: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Run SYSTEM and write results, by default results.csv, steps, summary and a picture."""
     with _interruptible(), ExitStack() as stack:
-        from rich.console import Console  # noqa: PLC0415  each command imports what it needs
-
-        from master_node.plots import plot_result  # noqa: PLC0415
-        from master_node.progress import ProgressBar, UploadBar, summary_table  # noqa: PLC0415
-        from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
+        if stay_with_parent:
+            _end_with_parent()
+        from master_node.progress import (  # noqa: PLC0415  each command imports what it needs
+            ProgressBar,
+            UploadBar,
+        )
         from master_node.simulation import run as run_system  # noqa: PLC0415
+        from master_node.study.case import apply_case, read_case  # noqa: PLC0415
         from master_node.system_files import open_system  # noqa: PLC0415
 
+        opened = stack.enter_context(open_system(system_file))
         system = (
-            stack.enter_context(open_system(system_file))
+            (opened if case is None else apply_case(opened, read_case(case)))
             .with_simulation(
                 preset=preset,
                 order=_order(order),
@@ -175,13 +192,98 @@ def run(  # noqa: PLR0917  options of the command line
             )
         except KeyboardInterrupt:
             raise InterruptedRunError("interrupted before the first step") from None
-        result = Result.load(output)
-        if not no_plot:
-            plot_result(result, output / PLOT_FILE, show=False, variables=None)
-        if not quiet:
-            console = Console()
-            console.print(summary_table(result.summary))
-            console.print(f"results in {output}", highlight=False)
+        _show(output, quiet=quiet, no_plot=no_plot)
+
+
+def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
+    """What came out: a picture and the summary."""
+    from rich.console import Console  # noqa: PLC0415
+
+    from master_node.progress import summary_table  # noqa: PLC0415
+    from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
+
+    result = Result.load(directory)
+    if not no_plot:
+        from master_node.plots import plot_result  # noqa: PLC0415  a second for matplotlib
+
+        plot_result(result, directory / PLOT_FILE, show=False, variables=None)
+    if not quiet:
+        console = Console()
+        console.print(summary_table(result.summary))
+        console.print(f"results in {directory}", highlight=False)
+
+
+@app.command()
+def resume(
+    directory: ResultDirectory,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
+) -> None:
+    """Go on with the run in DIRECTORY that was interrupted or killed, with the settings it had."""
+    with _interruptible():
+        from master_node.progress import ProgressBar  # noqa: PLC0415
+        from master_node.simulation import resume as resume_run  # noqa: PLC0415
+
+        try:
+            resume_run(directory, observers=(ProgressBar(quiet=quiet),))
+        except KeyboardInterrupt:
+            raise InterruptedRunError("interrupted before the next step") from None
+        _show(directory, quiet=quiet, no_plot=no_plot)
+
+
+@app.command()
+def sweep(  # noqa: PLR0917  as above
+    study_file: Annotated[
+        Path, typer.Argument(metavar="STUDY.toml", help="What to vary, and how.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(help="Directory for runs and table [default: STUDY_results, here]."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Runs at a time [default: one for each processor].")
+    ] = None,
+    dask: Annotated[
+        str | None, typer.Option(help="Scheduler of a Dask cluster to run on, tcp://HOST:PORT.")
+    ] = None,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Run those again that have failed.")
+    ] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Lose runs of another study in the directory.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
+) -> None:
+    """Run a system once for each case of a study; go on where an earlier sweep ended."""
+    with _interruptible():
+        from master_node.study.configuration import load_study  # noqa: PLC0415
+        from master_node.study.directory import TABLE_FILE  # noqa: PLC0415
+        from master_node.study.execution import run_study  # noqa: PLC0415
+        from master_node.study.progress import StudyProgress  # noqa: PLC0415
+        from master_node.study.runner import LocalRunner  # noqa: PLC0415
+
+        if dask is not None and workers is not None:
+            raise ConfigurationError("--workers is for this host: with --dask the cluster has them")
+        study = load_study(study_file)
+        directory = output or Path(f"{study_file.stem}_results")
+
+        def make_runner(held: StudyDirectory) -> Runner:
+            needs, limit = study.run.needs, study.licence_limit
+            if dask is None:
+                return LocalRunner(workers or _processors(), limit)
+            return _dask_runner(dask, held, needs, limit)
+
+        outcome = run_study(
+            study,
+            directory,
+            make_runner,
+            retry_failed=retry_failed,
+            replace=replace,
+            progress=StudyProgress(quiet=quiet),
+        )
+    typer.echo(directory / TABLE_FILE)
+    if outcome.failed:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -258,6 +360,23 @@ def export(
     path = output or system_file.with_suffix(".ssp")
     export_system(system_file, path)
     typer.echo(path)
+
+
+def _dask_runner(
+    address: str, directory: StudyDirectory, needs: tuple[str, ...], licence_limit: int | None
+) -> Runner:
+    if importlib.util.find_spec("distributed") is None:
+        raise ConfigurationError(
+            "--dask needs the package distributed", remedy="pip install 'doublestep[dask]'"
+        )
+    from master_node.study.dask_runner import DaskRunner  # noqa: PLC0415  an extra
+
+    return DaskRunner(address, directory, needs, licence_limit)
+
+
+def _processors() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @app.command("list")
@@ -342,6 +461,19 @@ def _interruptible() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         raise InterruptedRunError("interrupted") from None
+
+
+def _end_with_parent() -> None:
+    """Our standard input is the parent's end of a pipe: it closes when the parent is gone."""
+
+    def watch() -> None:
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(_END_TIME)
+        os._exit(InterruptedRunError.exit_code)  # a model in this process does not come back
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 def main() -> None:

@@ -8,11 +8,12 @@ without an estimator, in ``fixed_run.py``.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
 
+from master_node.checkpoints import NO_CHECKPOINTS, Checkpoints, Resumed
 from master_node.configuration import System
 from master_node.controlled_run import ControlledRun
 from master_node.coupling_scheme import (
@@ -55,6 +56,7 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
         )
     warnings = []
     for part in coupled.parts:
+        warnings += [f"{part.name}: {remark}" for remark in part.description.remarks]
         can = part.description.capabilities
         fixed = system.slaves[part.name].step_size or part.description.fixed_step_size
         if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:
@@ -132,6 +134,8 @@ class CoSimulation:
         observer: is told of everything.
         outputs: at T_0 of slaves that stand there already; None: they are
             still to be initialized.
+        checkpoints: are told where the run stands.
+        resumed: where to go on, with slaves that can be restored; None: at T_0.
     """
 
     group: SlaveGroup
@@ -139,6 +143,8 @@ class CoSimulation:
     system: System
     observer: Observer
     outputs: Outputs | None = None
+    checkpoints: Checkpoints = NO_CHECKPOINTS
+    resumed: Resumed | None = None
 
     def run(self) -> Statistics:
         """Initialize, step to the stop time, terminate.
@@ -156,6 +162,10 @@ class CoSimulation:
             outputs = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
         self.group.restart_statistics()
         statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
+        if self.resumed is not None:
+            self.checkpoints.restore(self.resumed)
+            self.group.continue_statistics(self.resumed.statistics)
+            statistics = replace(self.resumed.statistics, slaves=self.group.statistics)
         self.observer.started(
             RunStart(
                 self.coupled.output_names,
@@ -171,16 +181,23 @@ class CoSimulation:
                 {part.name: part.description.state_kind for part in self.coupled.parts},
             )
         )
-        begin = perf_counter()
+        begin = perf_counter() - statistics.wall_time
+
+        def update() -> None:
+            statistics.wall_time = perf_counter() - begin
+            statistics.round_trips = self.group.round_trips
+            statistics.wait_time = self.group.wait_time
+            for slave, restarts in self.checkpoints.restarts().items():
+                statistics.slaves[slave].restarts = restarts
+
         outcome, message = Outcome.FAILED, ""
         try:
+            self.checkpoints.begin(statistics, update)
             try:
                 with np.errstate(over="ignore", invalid="ignore"):  # the norm finds them
                     note = self._steps(scheme, outputs, statistics)
             finally:
-                statistics.wall_time = perf_counter() - begin
-                statistics.round_trips = self.group.round_trips
-                statistics.wait_time = self.group.wait_time
+                update()
                 self.group.restart_statistics()
             self._terminate(statistics.time)
             outcome, message = (Outcome.TERMINATED, note) if note else (Outcome.COMPLETED, "")
@@ -191,13 +208,22 @@ class CoSimulation:
             message = str(error)
             raise
         finally:
+            is_complete = outcome in (Outcome.COMPLETED, Outcome.TERMINATED)
+            self.checkpoints.end(is_complete=is_complete)
             self.observer.ended(RunEnd(outcome, statistics, message))
         return statistics
 
     def _steps(self, scheme: CouplingScheme, outputs: Outputs, statistics: Statistics) -> str:
         """Step to the end; a slave's wish to end earlier is returned in words."""
         context = RunContext(
-            self.group, self.coupled, scheme, self.system, self.observer, statistics
+            self.group,
+            self.coupled,
+            scheme,
+            self.system,
+            self.observer,
+            statistics,
+            self.checkpoints,
+            self.resumed,
         )
         estimator = ESTIMATORS.get(self.system.simulation.estimator)
         if estimator is None:

@@ -141,6 +141,10 @@ class SimulationSettings(_Table):
             ``none`` where the order is chosen, else ``rest``.
         output_interval: write results at start_time + i output_interval [s], by dense output,
             instead of at the communication points.
+        recovery: ``auto``: a slave process that died is started again, restored, and the run goes
+            on; ``off``: it ends the run.
+        checkpoint_interval: wall-clock time between two checkpoints for ``master-node resume``
+            [s]; 0: none are written.
         examine: let the slaves take trial steps before the first step, see ``examinations.py``.
     """
 
@@ -167,6 +171,8 @@ class SimulationSettings(_Table):
     largest_step_size: Positive | None = None
     initial_history: Literal["rest", "none"] | None = None
     output_interval: Positive | None = None
+    recovery: Literal["auto", "off"] = "auto"
+    checkpoint_interval: NotNegative = 10.0
     examine: StrictBool = True
 
     @model_validator(mode="before")
@@ -563,7 +569,8 @@ class System(_Table):
         try:
             super().__init__(**tables)
         except ValidationError as error:
-            raise _configuration_error(str(tables.get("source", "the system")), error) from None
+            source = str(tables.get("source", "the system"))
+            raise configuration_error(source, error, _known_keys) from None
 
     @model_validator(mode="after")
     def _names(self) -> Self:
@@ -605,6 +612,26 @@ class System(_Table):
             simulation |= {**_PAPER, "order": _PAPER["order"] if order == "auto" else order}
         simulation |= given
         return self._with(simulation=simulation)
+
+    def with_parameters(self, parameters: Mapping[str, Value]) -> System:
+        """The same system with other start values, by ``slave.variable``; they win over its own.
+
+        Raises:
+            ConfigurationError: there is no such slave, with the nearest names.
+        """
+        by_length = sorted(self.slaves, key=len, reverse=True)  # names may hold dots
+        given: dict[str, dict[str, Value]] = {}
+        for reference, value in parameters.items():
+            slave = next((name for name in by_length if reference.startswith(f"{name}.")), None)
+            if slave is None:
+                name = reference.partition(".")[0]
+                near = nearest(name, self.slaves)
+                raise ConfigurationError(f"{self.source}: {reference!r}: no slave {name!r}{near}")
+            given.setdefault(slave, {})[reference[len(slave) + 1 :]] = value
+        slaves = {name: slave.model_dump(exclude_unset=True) for name, slave in self.slaves.items()}
+        for name, values in given.items():
+            slaves[name]["parameters"] = {**self.slaves[name].parameters, **values}
+        return self._with(slaves=slaves)
 
     def with_slave(self, name: str, **settings: Any) -> System:
         """The same system with other settings of one slave."""
@@ -658,10 +685,19 @@ def load_system(path: Path) -> System:
     return System(**tables, base=path.absolute().parent, source=str(path))
 
 
-def _configuration_error(source: str, error: ValidationError) -> ConfigurationError:
+def configuration_error(
+    source: str, error: ValidationError, known_keys: Callable[[list[str]], list[str]]
+) -> ConfigurationError:
+    """All mistakes in a file, a line for each.
+
+    Args:
+        source: the file's name.
+        error: what pydantic found.
+        known_keys: the keys of the table at a place.
+    """
     sentences: dict[tuple[str, ...], str] = {}
-    for detail in error.errors():
-        sentences.setdefault(_place(detail), _sentence(detail))  # one for each union's branches
+    for detail in error.errors():  # one sentence for all branches of a union
+        sentences.setdefault(_place(detail), _sentence(detail, known_keys))
     return ConfigurationError("\n".join(f"{source}: {text}" for text in sentences.values()))
 
 
@@ -669,13 +705,13 @@ def _place(detail: ErrorDetails) -> tuple[str, ...]:
     return tuple(str(part) for part in detail["loc"] if part not in _UNION_BRANCHES)
 
 
-def _sentence(detail: ErrorDetails) -> str:
+def _sentence(detail: ErrorDetails, known_keys: Callable[[list[str]], list[str]]) -> str:
     """One mistake in the words of the file's author."""
     place = list(_place(detail))
     kind = detail["type"]
     if kind == "extra_forbidden":
         *tables, key = place
-        return f"{_table(tables)}unknown key {key!r}{nearest(key, _known_keys(tables))}"
+        return f"{_table(tables)}unknown key {key!r}{nearest(key, known_keys(tables))}"
     if kind == "missing":
         *tables, key = place
         return f"{_table(tables)}key {key!r} is missing"
@@ -700,6 +736,7 @@ _UNION_BRANCHES = frozenset(
     {
         *("float", "int", "bool", "str", "constrained-float", "constrained-int"),
         *("input-value", "input-settings", "is-instance[InputRows]", "callable"),
+        *("one-value", "values", "range", "same"),
     }
 )
 

@@ -38,7 +38,7 @@ from master_node.result_points import Reached, ReachedPoint, ResultPoints, count
 from master_node.run_context import RunContext
 from master_node.step_requests import FailedStep
 from master_node.step_size_rules import crossings, step_size_limits
-from protocol.errors import DoublestepError, SlaveError, StepSizeError
+from protocol.errors import DeadlineError, DoublestepError, SlaveError, StepSizeError
 from protocol.slave import StepStatus
 
 _INF = float("inf")
@@ -99,6 +99,8 @@ class ControlledRun:
         self._scheme = scheme
         self._observer = context.observer
         self._statistics = context.statistics
+        self._checkpoints = context.checkpoints
+        self._resumed = context.resumed
         self._estimator = estimator
         self._limits = step_size_limits(context.system)
         external = coupled.external
@@ -159,19 +161,28 @@ class ControlledRun:
         self._results = ResultPoints(
             self._settings.output_grid, self._scheme.has_derivative, self._start, outputs
         )
-        position = self._first_position(outputs)
+        if self._resumed is None:
+            position = self._first_position(outputs)
+        else:
+            position, self._results.memory = self._resumed.place(Position)
+        self._reached(position)
         for target, crossing in self._targets():
             while position.time < target:
                 following = self._advance(position, target)
                 if isinstance(following, str):
                     return following
                 position = following
-            if crossing is not None:
+                self._reached(position)
+            if crossing is not None and position.time < crossing[0].end:
                 following = self._cross(position, *crossing)
                 if isinstance(following, str):
                     return following
                 position = following
+                self._reached(position)
         return ""
+
+    def _reached(self, position: Position) -> None:
+        self._checkpoints.reached(position, self._results.memory)
 
     def _targets(self) -> Iterator[tuple[float, tuple[DoubleStepTimes, str] | None]]:
         """Where double steps must end: before each known event, and at the stop time."""
@@ -209,6 +220,7 @@ class ControlledRun:
         scale = 1.0 / self._control.weights(y[0])
         slope = y[1] if len(y) > 1 else None
         trial = trial_step_size(y[0], slope, scale, stop - self._start)
+        deadlines = 0
         for _ in range(_TRIALS):
             trial = min(trial, largest, (stop - position.time) / 2.0)
             times = self._limits.times(
@@ -216,6 +228,10 @@ class ControlledRun:
             )
             polynomials = self._polynomials(position)
             step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
+            if isinstance(step, FailedStep) and isinstance(step.original_error, DeadlineError):
+                deadlines += 1
+                if deadlines > 1:
+                    raise step.original_error
             if isinstance(step, DoubleStep):
                 error = self._control.judge(step)
                 if error.norm < _INF:
@@ -280,6 +296,7 @@ class ControlledRun:
         self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
     ) -> Position:
         self._stepper.accepted()
+        self._checkpoints.settle()
         times, polynomials = step.times, step.polynomials
         history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
         reached = _reached(step)
@@ -359,12 +376,14 @@ class ControlledRun:
             return f"{failed.slave} ended the simulation after t={times.begin!r} s"
         if failed.status is StepStatus.EARLY_RETURN:
             return self._before_event(position, failed, times, polynomials)
-        errors_in_a_row = position.errors_in_a_row + (failed.error is not None)
-        if failed.error is not None and errors_in_a_row > 1:
-            raise failed.error
+        error, errors_in_a_row = failed.original_error, position.errors_in_a_row
+        if error is not None and not failed.has_crashed:
+            errors_in_a_row += 1
+            if errors_in_a_row > 1:
+                raise error
         self._tell_rejected(times, polynomials, _INF, failed.reason)
         if self._is_smallest(times):
-            raise failed.error or self._stuck_for(failed.reason, times)
+            raise error or self._stuck_for(failed.reason, times)
         return replace(
             position,
             step_size=self._controller.after_discard(times.first, failed.reached),
@@ -437,6 +456,7 @@ class ControlledRun:
         if not error.norm < _INF:
             raise self._stuck(error, step.times)
         self._stepper.accepted()
+        self._checkpoints.settle()
         self._statistics.discontinuities += 1
         self._statistics.double_steps_at_discontinuities += 1
         times = step.times

@@ -74,6 +74,8 @@ class DefectRun:
         self._scheme = scheme
         self._observer = context.observer
         self._statistics = context.statistics
+        self._checkpoints = context.checkpoints
+        self._resumed = context.resumed
         self._limits = step_size_limits(context.system)
         self._crossings = crossings(context.system, self._limits, self._coupled.external.jumps)
         self._stepper = SingleStepper(context)
@@ -97,7 +99,10 @@ class DefectRun:
         self._results = ResultPoints(
             self._settings.output_grid, self._scheme.has_derivative, self._start, outputs
         )
-        position = self._first_position(outputs)
+        if self._resumed is None:
+            position = self._first_position(outputs)
+        else:
+            position, self._results.memory = self._resumed.place(_Position)
         try:
             for target, crossing in self._targets():
                 while position.time < target:
@@ -105,8 +110,10 @@ class DefectRun:
                         self._start, position.time, position.step_size, target
                     )
                     position = self._step(position, end, size)
-                if crossing is not None:
+                    self._checkpoints.reached(position, self._results.memory)
+                if crossing is not None and position.time < crossing[0].end:
                     position = self._cross(position, *crossing)
+                    self._checkpoints.reached(position, self._results.memory)
         except BrokenOffError as broken_off:  # a slave's wish
             time = self._statistics.time
             return f"{broken_off.failed.slave} ended the simulation after t={time!r} s"
@@ -201,6 +208,7 @@ class DefectRun:
                 raise
             remedy = remedy_without_rollback(failed.slave)
             raise unrepeatable(failed, step, remedy) from failed.error
+        self._checkpoints.settle()
         y = outputs.y
         u = self._coupled.inputs_of(y)
         error = self._coupling.judge(history, polynomials, ((end, u),), y[0])

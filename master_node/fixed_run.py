@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import ulp
+from typing import NamedTuple
 
 from master_node.numerics.extrapolation import CouplingHistory
 from master_node.numerics.step_size_controller import fixed_steps
@@ -17,6 +18,20 @@ from protocol.slave import StepStatus
 
 _NAN = float("nan")
 _REMEDY = "lower --step-size, or use an estimator, which repeats such steps"
+
+
+class _Position(NamedTuple):
+    """Where a run stands.
+
+    Attributes:
+        steps: taken so far.
+        history: inputs up to there.
+        outputs: there, those of continuous variables of shape (rows, m).
+    """
+
+    steps: int
+    history: CouplingHistory
+    outputs: Outputs
 
 
 class FixedRun:
@@ -46,9 +61,13 @@ class FixedRun:
             if settings.rests_before_start
             else CouplingHistory.start(start, u, depth)
         )
+        done = 0
+        if context.resumed is not None:
+            place, results.memory = context.resumed.place(_Position)
+            done, history, outputs = place
         last = fixed_steps(start, stop, h)
         rounding = 8.0 * ulp(max(abs(start), abs(stop)))
-        for n in range(1, last + 1):
+        for n in range(done + 1, last + 1):
             time = history.times[0]
             end = start + n * h if n < last else stop
             polynomials = scheme.extrapolation.polynomials(wanted, len(history.times))
@@ -61,6 +80,7 @@ class FixedRun:
                 if failed.status is StepStatus.TERMINATED:
                     return f"{failed.slave} ended the simulation after t={time!r} s"
                 raise unrepeatable(failed, step, _REMEDY) from failed.error
+            context.checkpoints.settle()
             history = history.pushed(end, coupled.inputs_of(outputs.y))
             reached = (ReachedPoint(end, *outputs),)
             count_accepted(context.statistics, step.step_size, reached)
@@ -70,4 +90,5 @@ class FixedRun:
             context.observer.attempted(
                 Attempt(time, step.step_size, order, slopes, _NAN, True, "", points)
             )
+            context.checkpoints.reached(_Position(n, history, outputs), results.memory)
         return ""

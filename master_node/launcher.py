@@ -10,7 +10,7 @@ from typing import Protocol, Self
 
 from protocol.errors import DoublestepError
 from protocol.keys import SlaveKey
-from protocol.slave_processes import SlaveProcess, end_all, end_error
+from protocol.slave_processes import SlaveProcess, describe_exit, end_all, end_error
 
 
 class Starter(Protocol):
@@ -29,8 +29,12 @@ class Starter(Protocol):
         """Why the process of slave ``name`` ended; None while it runs or when it is not ours."""
         ...
 
+    def how_ended(self, name: str) -> str:
+        """The same in a few words; "" while it runs or when it is not ours."""
+        ...
+
     def wait_ended(self, name: str, timeout: float) -> DoublestepError | None:
-        """The same after giving a dying process ``timeout`` seconds."""
+        """The error after giving a dying process ``timeout`` seconds."""
         ...
 
     def stop(self, *, at_once: bool = False) -> None:
@@ -71,12 +75,15 @@ class Launcher:
         self.stop(at_once=kind is not None and issubclass(kind, KeyboardInterrupt))
 
     def launch(self, name: str, model: str, base: Path) -> SlaveKey:
-        """Start a slave; its address on the bus, where it will appear.
+        """Start a slave, in place of the one of that name; its address, where it will appear.
 
         Raises:
             ConfigurationError: the process cannot be started.
         """
         key = SlaveKey.of_run(name, self._run)
+        before = self._processes.get(name)
+        if before is not None:
+            end_all([before], at_once=True)
         processor = None
         if self._processors:
             processor = self._processors[len(self._processes) % len(self._processors)]
@@ -88,6 +95,7 @@ class Launcher:
             log=self._log_directory / f"{name}.log",
             scratch=Path(self._scratch.name),
             processor=processor,
+            goes_on=before is not None,
         )
         return key
 
@@ -105,6 +113,12 @@ class Launcher:
         if process is None or code is None:
             return None
         return end_error(name, code, process.last_lines(), f"see {process.log}")
+
+    def how_ended(self, name: str) -> str:
+        """See `Starter`."""
+        process = self._processes.get(name)
+        code = process.exit_code if process else None
+        return "" if code is None else f"its process {describe_exit(code)}"
 
     def wait_ended(self, name: str, timeout: float) -> DoublestepError | None:
         """See `Starter`."""

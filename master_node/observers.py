@@ -125,12 +125,15 @@ class Outcome(StrEnum):
 
 @dataclass(slots=True)
 class SlaveStatistics:
-    """Counters of one slave over a run; times in seconds."""
+    """Counters of one slave over a run; times in seconds. ``restarts``: how often its process was
+    replaced.
+    """
 
     do_steps: int = 0
     rollbacks: int = 0
     requests: int = 0
     compute_time: float = 0.0
+    restarts: int = 0
 
 
 @dataclass(slots=True)

@@ -34,6 +34,7 @@ class Presence:
         self._changed = threading.Condition()
         self._alive: set[SlaveKey] = set()
         self._remotes: Mapping[SlaveKey, RemoteSlave] = {}
+        self._is_guarded = False
         bus.watch(alive_slaves(), self._told)
 
     def _told(self, key: str, alive: bool) -> None:
@@ -94,6 +95,32 @@ class Presence:
             found[name] = instances[0]
         return found
 
+    def wait_for(self, key: SlaveKey, launcher: Starter, timeout: float) -> None:
+        """Wait until a slave that was started again is alive.
+
+        Raises:
+            SlaveLostError: it did not appear within ``timeout`` seconds, or ended.
+            ModelError: it ended because its model cannot be used.
+        """
+        deadline = monotonic() + timeout
+        with self._changed:
+            while key not in self._alive:
+                error = launcher.ended(key.name)
+                if error is not None:
+                    raise error
+                if monotonic() > deadline:
+                    raise self._not_found([key.name], set(self._alive), timeout)
+                self._changed.wait(_POLL_TIME)
+
+    def follow(self, remote: RemoteSlave) -> None:
+        """Look after a slave that was started again, too."""
+        with self._changed:
+            self._remotes = {**self._remotes, remote.key: remote}
+            is_lost = remote.key not in self._alive
+            self._changed.notify_all()
+        if is_lost:
+            remote.lost()
+
     @staticmethod
     def _not_found(missing: list[str], alive: set[SlaveKey], timeout: float) -> SlaveLostError:
         there = ", ".join(sorted({k.name for k in alive})) or "no slave at all"
@@ -115,46 +142,58 @@ class Presence:
     def guarded(
         self,
         remotes: list[RemoteSlave],
-        has_ended: Callable[[RemoteSlave], bool],
+        why_ended: Callable[[RemoteSlave], str],
         reconnect_time: float,
+        can_restart: Callable[[str], bool] = lambda _: False,
     ) -> Iterator[None]:
         """Look after the slaves of a run: tell them when their token goes and comes.
 
-        One that stays away ends the run, however long the steps of the others take.
+        One that stays away ends the run, however long the steps of the others take, unless it can
+        be started again.
 
         Args:
             remotes: the slaves.
-            has_ended: whether it is certain that a slave's process is no more.
+            why_ended: why a slave's process is no more; "": it may live.
             reconnect_time: how long to wait for one that vanished [s].
+            can_restart: whether the slave of a name can be started again: then it alone is told.
         """
         with self._changed:
             self._remotes = {remote.key: remote for remote in remotes}
+            self._is_guarded = True
             lost = [remote for remote in remotes if remote.key not in self._alive]
         for remote in lost:
             remote.lost()
         guard = threading.Thread(
-            target=self._guard, args=(has_ended, reconnect_time), name="presence", daemon=True
+            target=self._guard,
+            args=(why_ended, reconnect_time, can_restart),
+            name="presence",
+            daemon=True,
         )
         guard.start()
         try:
             yield
         finally:
             with self._changed:
-                self._remotes = {}
+                self._remotes, self._is_guarded = {}, False
                 self._changed.notify_all()
             guard.join(_END_TIME)
 
-    def _guard(self, has_ended: Callable[[RemoteSlave], bool], reconnect_time: float) -> None:
+    def _guard(
+        self,
+        why_ended: Callable[[RemoteSlave], str],
+        reconnect_time: float,
+        can_restart: Callable[[str], bool],
+    ) -> None:
         since: dict[str, float] = {}
         warned: set[str] = set()
         while True:
             with self._changed:
                 absent = self._absent()
-                if self._remotes and not absent and not since:
+                if not self._is_guarded:
+                    return
+                if not absent and not since:
                     self._changed.wait()
                     continue
-                if not self._remotes:
-                    return
             now = monotonic()
             names = {remote.key.name for remote in absent}
             if back := sorted(warned - names):
@@ -163,16 +202,23 @@ class Presence:
             since = {name: since.get(name, now) for name in names}
             warned &= names
             for remote in absent:
-                if has_ended(remote):
-                    self._abandon(remote.key.name, "its process died")
-                    return
-                if now - since[remote.key.name] > reconnect_time:
-                    self._abandon(
-                        remote.key.name,
-                        f"the connection to it was lost and did not come back within "
-                        f"{reconnect_time:g} s",
+                name = remote.key.name
+                cause = why_ended(remote)
+                if not cause:
+                    if now - since[name] <= reconnect_time:
+                        continue
+                    cause = (
+                        "the connection to it was lost and did not come back within "
+                        f"{reconnect_time:g} s"
                     )
+                if not can_restart(name):
+                    self.abandon(name, cause)
                     return
+                self.forget(remote)
+                remote.abandon(name, cause)
+                names.discard(name)
+                warned.discard(name)
+                since.pop(name)
             late = {name for name in names if now - since[name] > _GRACE_TIME} - warned
             if late:
                 log.warning(
@@ -187,7 +233,13 @@ class Presence:
     def _absent(self) -> list[RemoteSlave]:
         return [remote for key, remote in self._remotes.items() if key not in self._alive]
 
-    def _abandon(self, slave: str, cause: str) -> None:
+    def forget(self, remote: RemoteSlave) -> None:
+        """Another one will take its place."""
+        with self._changed:
+            self._remotes = {key: r for key, r in self._remotes.items() if r is not remote}
+
+    def abandon(self, slave: str, cause: str) -> None:
+        """The run ends because of ``slave``: no wait for another one goes on."""
         with self._changed:
             remotes = list(self._remotes.values())
         for remote in remotes:

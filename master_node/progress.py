@@ -40,7 +40,7 @@ class ProgressBar:
 
     def __init__(self, quiet: bool = False, console: Console | None = None) -> None:
         self._quiet = quiet
-        self._console = _StandardError(stderr=True) if console is None else console
+        self._console = StandardError(stderr=True) if console is None else console
         self._progress: Progress | None = None
         self._task = TaskID(0)
         self._start_time = 0.0
@@ -122,7 +122,7 @@ class UploadBar:
     """
 
     def __init__(self, quiet: bool = False, console: Console | None = None) -> None:
-        self._console = _StandardError(stderr=True) if console is None else console
+        self._console = StandardError(stderr=True) if console is None else console
         self._quiet = quiet or not self._console.is_terminal
         self._progress: Progress | None = None
         self._task = TaskID(0)
@@ -159,10 +159,11 @@ class UploadBar:
             self._progress = None
 
 
-class _StandardError(Console):
+class StandardError(Console):
     """Rich ends the program when its pipe breaks; a run must not end because nobody looks."""
 
     def on_broken_pipe(self) -> None:
+        """Be silent from now on."""
         self.quiet = True
 
 

@@ -24,6 +24,7 @@ from protocol.processes import has_ended
 from protocol.slave import StartValue
 
 _CLAIM_TIME = 90.0  # a slave whose worker died loads its model again first
+_RELEASE_TIME = 5.0
 _GOODBYE_TIME = 0.3
 _STATUS_TIME = 0.5
 _PAUSE = 0.02
@@ -71,14 +72,18 @@ class RemoteSlave:
         self._is_present = True
         self._loss: tuple[str, str] | None = None
         self._execute = self._caller()
-        self._sequence = 0
         self._calls: Sequence[Call] = ()
         self._payload = b""
         self._pending: PendingReply | None = None
-        claim = Claim(run, socket.gethostname(), os.getpid(), orphan_time(reconnect_time))
-        caller = bus.caller(key.verb(CLAIM), _CLAIM_TIME)
-        answer = decode_map(caller.request(encode_map(claim.to_message())))
+        self._claim = Claim(run, socket.gethostname(), os.getpid(), orphan_time(reconnect_time))
+        self._take()
+
+    def _take(self) -> None:
+        """Claim it."""
+        caller = self._bus.caller(self._key.verb(CLAIM), _CLAIM_TIME)
+        answer = decode_map(caller.request(encode_map(self._claim.to_message())))
         self._epoch = int(answer["epoch"])
+        self._sequence = 0
         self._host = str(answer.get("host", ""))
         self._pid = int(answer.get("pid", 0))
 
@@ -89,6 +94,11 @@ class RemoteSlave:
     def key(self) -> SlaveKey:
         """Its address."""
         return self._key
+
+    @property
+    def is_present(self) -> bool:
+        """Whether its liveliness token is there."""
+        return self._is_present and self._loss is None
 
     @property
     def has_ended(self) -> bool:
@@ -164,6 +174,17 @@ class RemoteSlave:
             caller = self._execute
             self._changed.notify_all()
         caller.cancel()
+
+    def renew(self) -> None:
+        """Have its worker replaced by a new one that holds the model as it was loaded first.
+
+        Raises:
+            DoublestepError: the slave is gone, or its model cannot be loaded any more.
+        """
+        self.abort()
+        caller = self._bus.caller(self._key.verb(RELEASE), _RELEASE_TIME)
+        decode_map(caller.request(encode_map({"epoch": self._epoch})))
+        self._take()
 
     def release(self) -> None:
         """Give the slave back, in a bounded short time; errors do not matter any more."""

@@ -33,6 +33,20 @@ Reached = tuple[ReachedPoint, ...]
 """In the order of time."""
 
 
+class ResultMemory(NamedTuple):
+    """What is remembered from one accepted step to the next.
+
+    Attributes:
+        history: outputs at the last communication points.
+        d: discrete outputs at the last one.
+        number: of the next point of the grid.
+    """
+
+    history: OutputHistory
+    d: DiscreteValues
+    number: int
+
+
 class ResultPoints:
     """Results at the communication points, or on a grid by dense output.
 
@@ -55,6 +69,15 @@ class ResultPoints:
         self._history = OutputHistory((time,), (outputs.y,))
         self._d = outputs.d
         self._number = 1
+
+    @property
+    def memory(self) -> ResultMemory:
+        """What is remembered; set it to go on from there."""
+        return ResultMemory(self._history, self._d, self._number)
+
+    @memory.setter
+    def memory(self, memory: ResultMemory) -> None:
+        self._history, self._d, self._number = memory
 
     def reached(self, reached: Reached, order: int) -> Points:
         """The results up to the last of some communication points that were ``reached``.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from master_node.checkpoints import Checkpoints, Resumed
 from master_node.configuration import System
 from master_node.coupling_scheme import CouplingScheme
 from master_node.observers import Observer, Statistics
@@ -22,6 +23,8 @@ class RunContext:
         system: the settings.
         observer: is told of every step.
         statistics: are counted up.
+        checkpoints: are told where the run stands.
+        resumed: where it goes on; None: at T_0.
     """
 
     group: SlaveGroup
@@ -30,3 +33,5 @@ class RunContext:
     system: System
     observer: Observer
     statistics: Statistics
+    checkpoints: Checkpoints
+    resumed: Resumed | None = None

@@ -6,10 +6,14 @@ import logging
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from master_node.agent_models import Uploading
+from master_node.checkpoint_files import CheckpointStore
+from master_node.checkpoints import Checkpoints, ResultPosition, Resumed
 from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.configuration import InputSettings, System
 from master_node.configure_slaves import configure
@@ -17,13 +21,16 @@ from master_node.examinations import as_plain_data
 from master_node.input_loading import load_signals
 from master_node.observers import Observer, Observers
 from master_node.preparation import prepare
+from master_node.restorable_slave import RestorableSlave
 from master_node.results import (
     Recording,
     Result,
     ResultsWriter,
     SelectedResults,
+    SelectionMemory,
     check_variables,
 )
+from master_node.resumption import RunMode, can_be_saved, check_models, reopened, saved_system
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
 from master_node.step_size_rules import check_step_sizes, with_fixed_steps
@@ -90,21 +97,76 @@ def run(
         recording: is told of the results that the system asks for, as the files are.
         uploading: told of models that are sent to agents.
     """
+    mode = RunMode(in_process, launch)
+    _run(system, directory, mode, observers, recording=recording, uploading=uploading)
+
+
+def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None:
+    """Go on with a run whose master was interrupted or killed, or that failed.
+
+    Its results continue those in the directory, and end up the same, bit for bit, as if nothing
+    had happened.
+
+    Args:
+        directory: with the results and the checkpoint of the run.
+        observers: are told of everything that happens from there on.
+
+    Raises:
+        ResultsError: there is no checkpoint, or a file cannot be read.
+        ConfigurationError: a model or a table is not the one with which the run began.
+        DoublestepError: as `simulate`.
+    """
+    directory = Path(directory)
+    store = CheckpointStore(directory)
+    saved, checkpoint = store.load()
+    resumption = Resumption(saved, store, Resumed.of(checkpoint))
+    with reopened(saved) as (system, mode):
+        _run(system, directory, mode, observers, resumption=resumption)
+
+
+@dataclass(frozen=True)
+class Resumption:
+    """A run that goes on.
+
+    Attributes:
+        saved: what was run.
+        store: of its checkpoints.
+        resumed: where it goes on.
+    """
+
+    saved: Mapping[str, Any]
+    store: CheckpointStore
+    resumed: Resumed
+
+
+def _run(
+    system: System,
+    directory: Path | None,
+    mode: RunMode,
+    observers: Sequence[Observer],
+    *,
+    recording: Recording | None = None,
+    resumption: Resumption | None = None,
+    uploading: Uploading | None = None,
+) -> None:
     settings = settings_of(system, {})
     check_step_sizes(system)
     signals = load_signals(system)
     if directory is not None:
         ResultsWriter(directory, settings).prepare()
-    with _slaves(
-        system, directory, in_process=in_process, launch=launch, uploading=uploading
-    ) as slaves:
-        descriptions = configure(slaves.links, system, slaves.descriptions)
+    with _slaves(system, directory, mode, uploading) as slaves:
+        if resumption is not None:
+            check_models(resumption.saved, slaves.descriptions)
+        restorable = _restorable(slaves, system, directory)
+        links = {**slaves.links, **{slave.name: slave for slave in restorable}}
+        given = system
+        descriptions = configure(links, system, slaves.descriptions)
         system = with_fixed_steps(system, descriptions)
         check_step_sizes(system)
         warnings = check_capabilities(resolve(system, descriptions, signals), system)
         for warning in warnings:
             log.warning("%s", warning)
-        group = SlaveGroup(slaves.links)
+        group = SlaveGroup(links)
         prepared = prepare(group, system, descriptions, signals)
         coupled = resolve(prepared.system, prepared.descriptions, signals)
         for warning in check_capabilities(coupled, prepared.system):
@@ -114,33 +176,82 @@ def run(
         check_variables(
             wanted.variables, (*coupled.output_names, *coupled.discrete.names), system.source
         )
+        resumed = None if resumption is None else resumption.resumed
+        store = None
+        if resumption is not None:
+            store = resumption.store
+        elif directory is not None and _writes_checkpoints(given):
+            store = CheckpointStore(directory, saved_system(given, mode, slaves.descriptions))
         keepers: list[Observer] = [] if recording is None else [recording]
+        writer = None
         if directory is not None:
             settings = settings_of(prepared.system, prepared.descriptions)
             settings["examinations"] = as_plain_data(prepared.examinations)
-            keepers.append(ResultsWriter(directory, settings))
-        selected = SelectedResults(Observers(keepers), wanted.variables, wanted.every)
+            rows = None if resumed is None else resumed.rows
+            writer = ResultsWriter(directory, settings, rows, can_resume=store is not None)
+            keepers.append(writer)
+        selection = SelectionMemory() if resumed is None else resumed.files.selection
+        selected = SelectedResults(Observers(keepers), wanted.variables, wanted.every, selection)
         observer = Observers([*observers, selected])
-        CoSimulation(group, coupled, prepared.system, observer, prepared.outputs).run()
+        checkpoints = Checkpoints(
+            restorable,
+            store,
+            system.simulation.checkpoint_interval,
+            None if writer is None else _ResultFiles(writer, selected),
+            0 if resumed is None else resumed.checkpoint.number,
+        )
+        CoSimulation(
+            group, coupled, prepared.system, observer, prepared.outputs, checkpoints, resumed
+        ).run()
+
+
+def _writes_checkpoints(system: System) -> bool:
+    return bool(system.simulation.checkpoint_interval) and can_be_saved(system)
+
+
+@dataclass(frozen=True)
+class _ResultFiles:
+    """Implements `ResultFiles`."""
+
+    writer: ResultsWriter
+    selected: SelectedResults
+
+    def position(self) -> ResultPosition:
+        """See `ResultFiles`."""
+        return ResultPosition(*self.writer.rows, self.selected.memory)
+
+    def flush(self) -> None:
+        """See `ResultFiles`."""
+        self.writer.synchronize()
+
+
+def _restorable(slaves: Slaves, system: System, directory: Path | None) -> list[RestorableSlave]:
+    """The slaves in front of which calls are noted: all or none."""
+    if slaves.restarts is None and (directory is None or not _writes_checkpoints(system)):
+        return []
+    return [
+        RestorableSlave(
+            name,
+            link,
+            slaves.descriptions[name],
+            None if slaves.restarts is None else partial(slaves.restarts.restart, name),
+        )
+        for name, link in slaves.links.items()
+    ]
 
 
 @contextmanager
 def _slaves(
-    system: System,
-    directory: Path | None,
-    *,
-    in_process: bool,
-    launch: bool,
-    uploading: Uploading | None,
+    system: System, directory: Path | None, mode: RunMode, uploading: Uploading | None
 ) -> Iterator[Slaves]:
-    if in_process:
+    if mode.in_process:
         with slaves_in_process(system) as slaves:
             yield slaves
         return
     with tempfile.TemporaryDirectory(prefix="doublestep-") as temporary:
         logs = Path(temporary) if directory is None else directory / "logs"
         logs.mkdir(exist_ok=True)
-        with slaves_on_bus(system, logs, launch=launch, uploading=uploading) as slaves:
+        with slaves_on_bus(system, logs, launch=mode.launch, uploading=uploading) as slaves:
             yield slaves
 
 

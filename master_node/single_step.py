@@ -76,9 +76,10 @@ def unrepeatable(failed: FailedStep, step: DoStep, remedy: str) -> DoublestepErr
         step: that was to be taken, as far as ``failed`` does not say.
         remedy: what the user can do.
     """
-    if failed.error is not None:
-        failed.error.remedy = failed.error.remedy or remedy
-        return failed.error
+    error = failed.original_error
+    if error is not None:
+        error.remedy = error.remedy or remedy
+        return error
     step = failed.step or step
     reason = failed.reason
     if failed.status is StepStatus.DISCARD:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from time import perf_counter
 
-from master_node.observers import SlaveStatistics
+from master_node.observers import SlaveStatistics, Statistics
 from master_node.slave_link import SlaveLink
 from protocol.calls import Call, DoStep, Reply, SetState
 from protocol.errors import DoublestepError
@@ -35,6 +36,12 @@ class SlaveGroup:
         self._statistics = tuple(self.statistics.values())
         self.round_trips = 0
         self.wait_time = 0.0
+
+    def continue_statistics(self, before: Statistics) -> None:
+        """Count on from those of a run that is resumed."""
+        self.statistics = {name: replace(before.slaves[name]) for name in self.names}
+        self._statistics = tuple(self.statistics.values())
+        self.round_trips, self.wait_time = before.round_trips, before.wait_time
 
     def __len__(self) -> int:
         return len(self._links)

@@ -20,6 +20,7 @@ from master_node.configuration import System
 from master_node.launcher import Launcher, Starter
 from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
+from master_node.restarts import Restarts
 from master_node.slave_link import LocalSlave, SlaveLink
 from protocol.bus import DEFAULT_ENDPOINT
 from protocol.calls import Describe
@@ -32,6 +33,7 @@ from protocol.errors import (
     InterruptedRunError,
     SlaveLostError,
 )
+from protocol.keys import SlaveKey
 from protocol.slave import SlaveDescription
 from protocol.slave_processes import connection_options
 from protocol.zenoh_bus import ZenohBus
@@ -47,16 +49,20 @@ class Slaves:
         links: to each of them.
         descriptions: what each said of itself.
         starters: of those that were started for this run.
+        restarts: starts those of this host again, None in process.
     """
 
     links: Mapping[str, SlaveLink]
     descriptions: Mapping[str, SlaveDescription]
     starters: Sequence[Starter] = ()
+    restarts: Restarts | None = None
 
     def explain(self, error: DoublestepError) -> DoublestepError:
         """A lost slave's error with the exit code and last words of its process, if it is ours."""
         if not isinstance(error, SlaveLostError):
             return error
+        if self.restarts is not None and self.restarts.is_mine(error.slave):
+            return error  # it says itself what became of it
         for starter in self.starters:
             ended = starter.wait_ended(error.slave, _DEATH_TIME)
             if ended is not None:
@@ -141,23 +147,36 @@ def slaves_on_bus(
         presence = Presence(bus)
         keys |= presence.wait(found, keys, starters, system.bus.discovery_timeout)
         remotes: dict[str, RemoteSlave] = {}
-        for name in system.slaves:
+        stack.callback(_release, remotes)
+
+        def claim(key: SlaveKey) -> RemoteSlave:
+            times = system.bus.step_timeout, system.bus.reconnect_time
             try:
-                remotes[name] = RemoteSlave(
-                    bus, keys[name], run, system.bus.step_timeout, system.bus.reconnect_time
-                )
+                return RemoteSlave(bus, key, run, *times)
             except DoublestepError as error:
-                raise error.located(slave=name, phase="claim") from None
-            stack.callback(remotes[name].release)
+                raise error.located(slave=key.name, phase="claim") from None
 
-        def has_ended(remote: RemoteSlave) -> bool:
-            name = remote.key.name
-            return remote.has_ended or any(s.ended(name) is not None for s in starters)
+        for name in system.slaves:
+            remotes[name] = claim(keys[name])
 
+        def why_ended(remote: RemoteSlave) -> str:
+            died = "its process died" if remote.has_ended else ""
+            if died:
+                launcher.wait_ended(remote.key.name, _DEATH_TIME)
+            found = (starter.how_ended(remote.key.name) for starter in starters)
+            return next(filter(None, found), died)
+
+        recovers = system.simulation.recovery == "auto"
         stack.enter_context(
-            presence.guarded(list(remotes.values()), has_ended, system.bus.reconnect_time)
+            presence.guarded(
+                list(remotes.values()),
+                why_ended,
+                system.bus.reconnect_time,
+                lambda name: recovers and name in launched,
+            )
         )
-        slaves = Slaves(remotes, _describe(remotes), starters)
+        restarts = Restarts(system, remotes, claim, launcher, presence, frozenset(launched))
+        slaves = Slaves(dict(remotes), _describe(remotes), starters, restarts if recovers else None)
         agents.verify(slaves.descriptions)
         try:
             yield slaves
@@ -168,6 +187,11 @@ def slaves_on_bus(
             if isinstance(error, DeadlineError) and error.slave in remotes:
                 remotes[error.slave].abort()
             raise slaves.explain(error) from error.__cause__
+
+
+def _release(remotes: Mapping[str, RemoteSlave]) -> None:
+    for remote in reversed(list(remotes.values())):
+        remote.release()
 
 
 def _describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:

@@ -18,6 +18,7 @@ from master_node.external_inputs import ExternalSignal
 from master_node.numerics.norms import first_not_finite
 from master_node.output_evaluation import OutputEvaluation
 from master_node.outputs import Outputs
+from master_node.restorable_slave import BrokenStepError
 from master_node.slave_group import Program, SlaveGroup
 from master_node.system import CoupledSystem
 from protocol.calls import (
@@ -64,6 +65,16 @@ class FailedStep:
     error: DoublestepError | None = None
     step: DoStep | None = None
     time: float = float("nan")
+
+    @property
+    def has_crashed(self) -> bool:
+        """Whether the step ended the process of its slave, which can be restored."""
+        return isinstance(self.error, BrokenStepError) and self.error.is_crash
+
+    @property
+    def original_error(self) -> DoublestepError | None:
+        """The error with which a run ends that does not repeat the step."""
+        return self.error.original if isinstance(self.error, BrokenStepError) else self.error
 
 
 Inputs = Callable[[FloatArray], FloatArray]

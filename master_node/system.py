@@ -264,10 +264,11 @@ def resolve(
 
 def _depends(parts: Sequence[SlavePart], inputs: Mapping[str, Sequence[str]]) -> NDArray[np.bool_]:
     """Whether each output depends directly on one of these inputs of its slave, shape (m,)."""
+    names = [frozenset(inputs[part.name]) for part in parts]
     return np.array(
         [
-            not set(part.description.feed_through.get(output, ())).isdisjoint(inputs[part.name])
-            for part in parts
+            not own.isdisjoint(part.description.feed_through.get(output, ()))
+            for part, own in zip(parts, names, strict=True)
             for output in part.outputs
         ],
         dtype=np.bool_,

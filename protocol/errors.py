@@ -10,7 +10,8 @@
     │   ├── StepRejectedError    a step failed in the slave; a smaller one may succeed    exit 4
     │   ├── FatalSlaveError      fmi2Fatal: the model must not be called any more          exit 4
     │   ├── StepSizeError        the smallest communication step size was reached         exit 4
-    │   └── SlaveCrashedError    the process that holds the model died                    exit 4
+    │   └── SlaveCrashedError    the process that holds the model died of the model       exit 4
+    │       └── SlaveKilledError it was ended from outside                                exit 3
     ├── DeadlineError            a wait reached its bound                                 exit 5
     ├── ProtocolError            the two sides do not speak the same language             exit 6
     │   ├── MalformedMessageError  bytes that are not a message, or beyond a limit        exit 6
@@ -153,6 +154,12 @@ class StepSizeError(SlaveError):
 
 class SlaveCrashedError(SlaveError):
     """The worker process that held the model died; the slave node itself still answers."""
+
+
+class SlaveKilledError(SlaveCrashedError):
+    """The same by a signal from outside, such as SIGKILL: the model has nothing to do with it."""
+
+    exit_code = 3
 
 
 class DeadlineError(DoublestepError):

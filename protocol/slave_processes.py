@@ -39,9 +39,10 @@ class SlaveProcess:
         base: directory to which the model's path is relative.
         key: its address on the bus, where it will appear.
         connection: options of ``slave-node serve`` that lead it to the bus.
-        log: file for what it says; what was in it is lost.
+        log: file for what it says.
         scratch: existing directory for its temporary files; the caller removes it.
         processor: the only one that it uses; None: any.
+        goes_on: leave what is in the log.
 
     Raises:
         ConfigurationError: the process cannot be started.
@@ -57,6 +58,7 @@ class SlaveProcess:
         log: Path,
         scratch: Path,
         processor: int | None = None,
+        goes_on: bool = False,
     ) -> None:
         command = [sys.executable, "-m", "slave_node", "serve", model]
         command += ["--base", str(base), "--name", key.name, "--instance", key.instance]
@@ -66,7 +68,7 @@ class SlaveProcess:
         self.key = key
         self.log = log
         try:
-            with log.open("wb") as file:
+            with log.open("ab" if goes_on else "wb") as file:
                 self._process = subprocess.Popen(
                     command,
                     stdin=subprocess.PIPE,
@@ -160,8 +162,15 @@ def end_error(name: str, exit_code: int, lines: Sequence[str], remedy: str) -> D
     last = " | ".join(word.removeprefix(_ERROR) for word in words) or "nothing"
     if exit_code == _USAGE_EXIT_CODE:
         return ModelError(last, slave=name)
-    how = f"died by signal {-exit_code}" if exit_code < 0 else f"ended with exit code {exit_code}"
+    how = describe_exit(exit_code)
     return SlaveLostError(f"its process {how}; its log ends: {last}", slave=name, remedy=remedy)
+
+
+def describe_exit(exit_code: int) -> str:
+    """How a process ended, in a few words."""
+    if exit_code < 0:
+        return f"died by signal {-exit_code}"
+    return f"ended with exit code {exit_code}"
 
 
 def _environment(scratch: Path) -> dict[str, str]:

@@ -133,6 +133,8 @@ def serve(  # noqa: PLR0917  options of the command line
         _end_with_parent(end)
     try:
         description = worker.start()
+        for remark in description.remarks:
+            log.warning("%s", remark)
         bus = ZenohBus(endpoints, stop=ending)
         node = SlaveNode(bus, worker, key, description)
         if not ending.is_set():
@@ -188,6 +190,38 @@ def router(
     finally:
         bus.close()
     log.info("ended")
+
+
+@app.command()
+def check(
+    name: Annotated[str, typer.Argument(help="Slave to look for [default: a router].")] = "",
+    connect: Annotated[
+        str, typer.Option(help="Router, or the slave itself where it listens.")
+    ] = DEFAULT_ENDPOINT,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
+    ] = False,
+    tls: Tls = None,
+    timeout: Annotated[float, typer.Option(min=0.1, help="For the connection [s].")] = 3.0,
+) -> None:
+    """Exit code 0 if NAME serves, 3 if not: for health checks of service managers."""
+    from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  each command imports what it needs
+    from slave_node.health import check_alive  # noqa: PLC0415
+
+    role = Role.SLAVE if name else Role.ROUTER
+    endpoints = Endpoints(
+        connect=(connect,),
+        insecure=insecure,
+        mode=Mode.CLIENT,
+        credentials=None if tls is None else Credentials(tls.absolute(), role),
+    )
+    if name:
+        check_name(name)
+    bus = ZenohBus(endpoints, timeout=timeout)
+    try:
+        check_alive(bus, name)
+    finally:
+        bus.close()
 
 
 @app.command()
@@ -339,6 +373,35 @@ def inspect(
     console = Console()
     for table in description_tables(description):
         console.print(table)
+
+
+@app.command()
+def validate(
+    model: Model,
+    step_size: Annotated[
+        float | None, typer.Option(help="Of the trial steps [s] [default: the model's, or 0.01].")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Try what MODEL can do, and say what Doublestep does about the rest."""
+    from slave_node.validation import is_usable, unusable  # noqa: PLC0415
+    from slave_node.validation import validate as trials  # noqa: PLC0415
+
+    findings = []
+    if as_json:
+        findings = list(trials(model, Path.cwd(), step_size))
+        typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
+    else:
+        from rich.console import Console  # noqa: PLC0415
+
+        from slave_node.inspection import report_table  # noqa: PLC0415
+
+        console = Console()
+        with console.status("trying"):
+            findings = list(trials(model, Path.cwd(), step_size))
+        console.print(report_table(model, findings))
+    if not is_usable(findings):
+        raise unusable(model)
 
 
 def _where(endpoints: Endpoints) -> str:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
+from rich.text import Text
 
 from protocol.slave import SlaveDescription
+from slave_node.validation import Finding, Grade
 
 _STATE = {
     "native": "saved and restored by the model itself",
@@ -24,6 +28,20 @@ _INPUTS = {
 def description_tables(description: SlaveDescription) -> list[Table]:
     """The model, its variables and its capabilities as tables."""
     return [_model(description), _variables(description)]
+
+
+def report_table(model: str, findings: Sequence[Finding]) -> Table:
+    """The report of ``slave-node validate``."""
+    table = Table(title=model, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in ("tried", "", "result", "so"):
+        table.add_column(column, overflow="fold")
+    for finding in findings:
+        style = _STYLES[finding.grade]
+        table.add_row(finding.what, Text(finding.grade, style), finding.result, finding.consequence)
+    return table
+
+
+_STYLES = {Grade.OK: "green", Grade.NOTE: "yellow", Grade.PROBLEM: "bold red"}
 
 
 def _model(description: SlaveDescription) -> Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from tempfile import mkdtemp
 
 from protocol.calls import Configure
 from protocol.errors import ModelError
@@ -43,11 +44,9 @@ def load_slave(
     """
     choice = choose(_describe_alone(model, base), configuration.state_kind)
     alone = replace(configuration, state_kind="")
-    numbers = count()
 
     def load() -> Slave:
-        directory = scratch / f"model-{next(numbers)}"
-        directory.mkdir()
+        directory = Path(mkdtemp(prefix="model-", dir=scratch))
         return load_model(model, base, name, directory, log_all=log_all, configuration=alone)
 
     def load_forking(reason: str) -> Slave:

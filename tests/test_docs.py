@@ -41,6 +41,18 @@ from master_node.configuration import (
     load_system,
 )
 from master_node.numerics.error_estimators import EST_MOD, EST_RICH
+from master_node.numerics.reductions import REDUCTIONS
+from master_node.study.configuration import (
+    Cases,
+    Resources,
+    RunSettings,
+    Sample,
+    Study,
+    load_study,
+)
+from master_node.study.configuration import ResultSettings as StudyResults
+from master_node.study.plan import Plan
+from master_node.study.table import StudyTable
 from protocol import codec, errors
 from protocol.calls import CALLS
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState
@@ -334,6 +346,49 @@ def test_every_table_of_a_system_file_is_in_the_document() -> None:
     assert headings == list(TABLES)
     tables_of_files = set(System.model_fields) - {"base", "source"}
     assert tables_of_files == {re.findall(r"\w+", heading)[0] for heading in headings}
+
+
+# --- studies ------------------------------------------------------------------------------------
+
+STUDY_TABLES: dict[str, type[BaseModel]] = {
+    "## Keys of a study": Study,
+    "### `[sample]`": Sample,
+    "### `[cases]`": Cases,
+    "### `[run]`": RunSettings,
+    "### `[resources]`": Resources,
+    "### `[results]`": StudyResults,
+}
+
+
+@pytest.mark.parametrize("heading", STUDY_TABLES)
+def test_the_keys_of_a_study_are_those_in_the_document(heading: str) -> None:
+    """Every key, no other, in the same order, with the same default where it is a value."""
+    table, *_ = tables(section(read("docs/sweep.md"), heading))
+    fields = STUDY_TABLES[heading].model_fields
+    known = {name: field for name, field in fields.items() if name not in ("base", "source")}
+    assert [row[0] for row in table[1:]] == [f"`{name}`" for name in known]
+    for key, _, default, _ in table[1:]:
+        value = known[key.strip("`")].get_default(call_default_factory=True)
+        if default.startswith("`"):
+            assert tomllib.loads(f"x = {default.strip('`')}")["x"] == json_of(value), key
+
+
+def test_the_document_of_studies_has_every_option_reduction_and_column() -> None:
+    """And the study that it shows is the example."""
+    text = read("docs/sweep.md")
+    options = set(re.findall(r"--[a-z-]+", help_of("master-node", "sweep"))) - {"--help"}
+    table, *_ = [t for t in tables(text) if t[0][0] == "option"]
+    assert set(re.findall(r"--[a-z-]+", " ".join(row[0] for row in table[1:]))) == options
+    (reductions,) = [t for t in tables(text) if t[0][0] == "`reduce`"]
+    names = [name for row in reductions[1:] for name in re.findall(r"\w+", row[0])]
+    assert names == list(REDUCTIONS)
+    (example,) = blocks(text, "toml")
+    assert tomllib.loads(example) == tomllib.loads(read("examples/sweep/spring.toml"))
+    study = load_study(ROOT / "examples" / "sweep" / "spring.toml")
+    (directory,) = [t for t in tables(text) if t[0][0] == "file" and t[1][0] == "`study.csv`"]
+    told = re.findall(r"`(\w+)`", directory[1][1])
+    columns = [c for c in StudyTable(Plan(study, (), ())).columns if c not in study.results.outputs]
+    assert told == columns
 
 
 # --- the protocol -------------------------------------------------------------------------------

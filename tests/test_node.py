@@ -48,6 +48,7 @@ from protocol.errors import (
     SequenceError,
     SlaveBusyError,
     SlaveCrashedError,
+    SlaveKilledError,
     VersionError,
 )
 from protocol.keys import (
@@ -591,7 +592,7 @@ def test_abort_ends_an_endless_step(
     assert time.perf_counter() - begin < 2.0
     (reply,) = outcome
     assert isinstance(reply, Reply)
-    assert type(reply.error) is SlaveCrashedError
+    assert type(reply.error) is SlaveKilledError
     assert "SIGKILL" in str(reply.error)
     assert master.status()["worker"] == "dead"
     master.release()

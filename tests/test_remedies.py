@@ -64,10 +64,11 @@ class Workshop:
             connections=DISPLACEMENT,
         )
         wheel = TimedSlave(WHEEL, (0.0, 0.1))
-        self.links = {
-            "chassis": LocalSlave(Executor(self.load(Configure()), self.load)),
-            "wheel": LocalSlave(Executor(wheel)),
+        self.executors = {
+            "chassis": Executor(self.load(Configure()), self.load),
+            "wheel": Executor(wheel),
         }
+        self.links = {name: LocalSlave(executor) for name, executor in self.executors.items()}
         self.group = SlaveGroup(self.links)
 
     def load(self, configuration: Configure) -> Slave:
@@ -89,15 +90,16 @@ class Workshop:
 
     def prepare(self) -> Prepared:
         """As a run does it."""
-        descriptions = configure(self.links, self.system)
-        return prepare(self.group, self.system, descriptions)
+        loaded = {name: link.description for name, link in self.executors.items()}
+        descriptions = configure(self.links, self.system, loaded)
+        return prepare(self.group, self.system, descriptions, {})
 
 
 def test_exact_slaves_stay_where_they_are() -> None:
     """No reset, nothing loaded anew, and the outputs at T_0 are handed on."""
     workshop = Workshop({"native": TimedSlave})
     prepared = workshop.prepare()
-    assert prepared.y is not None
+    assert prepared.outputs is not None
     assert workshop.resets == 0
     assert workshop.loaded == [Configure()]
     assert prepared.system is workshop.system
@@ -138,11 +140,11 @@ def test_states_that_cannot_be_trusted_are_saved_in_another_way(
     assert prepared.warnings[0].startswith("chassis: its saved states (")
     last = prepared.examinations["chassis"].state_verdict
     if kind == "none":
-        assert prepared.y is None
+        assert prepared.outputs is None
         assert last is StateVerdict.DOES_NOT_REPEAT
         assert prepared.warnings[-1].endswith("steps cannot be taken back")
     else:
-        assert prepared.y is not None  # from the round that found nothing wrong
+        assert prepared.outputs is not None  # from the round that found nothing wrong
         assert last is StateVerdict.EXACT
 
 
@@ -153,7 +155,7 @@ def test_a_solver_that_restarts_is_named_and_accepted() -> None:
     (warning,) = prepared.warnings
     assert warning.startswith("chassis: going back to a saved state restarts the model's solver")
     assert workshop.resets == 1
-    assert prepared.y is None
+    assert prepared.outputs is None
     assert len(workshop.loaded) == 1
 
 
@@ -167,7 +169,7 @@ def test_a_clock_puts_h_on_its_grid() -> None:
         "chassis: its outputs move only at multiples of 0.01 s; its communication steps are now "
         "multiples of that",
     )
-    assert prepared.y is not None
+    assert prepared.outputs is not None
 
 
 def test_with_emulated_inputs_substeps_are_on_the_grid_of_the_clock_too() -> None:
@@ -228,7 +230,7 @@ def test_input_derivatives_that_are_refused_are_emulated() -> None:
     prepared = workshop.prepare()
     assert prepared.descriptions["chassis"].input_derivatives is InputDerivatives.EMULATED
     assert "refuses input derivatives, so they are emulated" in prepared.warnings[0]
-    assert prepared.y is not None
+    assert prepared.outputs is not None
     assert Workshop({"native": FirstOrder}, order=1).prepare().warnings == ()
 
 
@@ -238,7 +240,7 @@ def test_no_trial_steps_where_nothing_hangs_on_them(settings: dict[str, Any]) ->
     workshop = Workshop({"native": BrokenSlave}, **settings)
     prepared = workshop.prepare()
     assert not prepared.examinations
-    assert prepared.y is None
+    assert prepared.outputs is None
     assert len(workshop.loaded) == 1
 
 

@@ -29,7 +29,7 @@ from master_node.results.files import (
 )
 from master_node.results.recording import Recording
 from master_node.results.result import Result
-from master_node.results.selection import SelectedResults, check_variables, chosen
+from master_node.results.selection import SelectedResults, SelectionMemory, check_variables, chosen
 from master_node.results.steps_file import STEPS_DTYPE
 from master_node.results.summary import summarize
 from master_node.results.writer import ResultsWriter
@@ -47,6 +47,7 @@ __all__ = [
     "Result",
     "ResultsWriter",
     "SelectedResults",
+    "SelectionMemory",
     "check_variables",
     "chosen",
     "summarize",

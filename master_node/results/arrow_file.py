@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from master_node.observers import DiscreteType, DiscreteValue, Point
 from master_node.results.columns import DTYPES, Columns, Table
-from master_node.results.files import BatchFile, cannot_read, malformed
+from master_node.results.files import BatchFile, cannot_read, malformed, replacing
 from protocol.errors import ResultsError
 
 _TYPES: Mapping[DiscreteType, pa.DataType] = {
@@ -40,16 +40,23 @@ class ArrowFile(BatchFile):
     """The file while a run goes on.
 
     Args:
-        path: of the new file.
+        path: of the file.
         columns: of the run.
         settings_sha256: of the run.
+        rows: how many rows of it count; None: it is a new one.
+
+    Raises:
+        ResultsError: the file cannot be read, is of another run, or has fewer rows.
     """
 
-    def __init__(self, path: Path, columns: Columns, settings_sha256: str) -> None:
-        super().__init__(path)
+    def __init__(
+        self, path: Path, columns: Columns, settings_sha256: str, rows: int | None = None
+    ) -> None:
         self._types = columns.discrete_types
         self._schema = _schema(columns, settings_sha256)
-        self._head: bytes = self._schema.serialize().to_pybytes()
+        head: bytes = self._schema.serialize().to_pybytes()
+        super().__init__(path, None if rows is None else _cut(path, self._schema, head, rows))
+        self._head = head if rows is None else b""
         self._rows = array("d")
         self._discrete: list[tuple[DiscreteValue, ...]] = []
 
@@ -169,6 +176,25 @@ def read_arrow(path: Path) -> Table:
         return table_of(
             path, pa.Table.from_batches(list(stream.batches()), stream.schema), stream.columns
         )
+
+
+def _cut(path: Path, schema: pa.Schema, head: bytes, rows: int) -> int:
+    """Leave the first ``rows`` rows in a stream that has no end then; its size [bytes]."""
+    left = rows
+    with Stream(path) as stream, replacing(path) as file:
+        if not stream.schema.equals(schema):
+            raise malformed(path, "its columns are not those of the run")
+        file.write(head)
+        for batch in stream.batches():
+            if not left:
+                break
+            part = batch.slice(0, left)
+            file.write(part.serialize().to_pybytes())
+            left -= part.num_rows
+        if left:
+            found = rows - left
+            raise malformed(path, f"{found} rows instead of {rows}, which the checkpoint names")
+        return file.tell()
 
 
 def columns_of(schema: pa.Schema, path: Path) -> Columns:

@@ -25,13 +25,14 @@ class CsvFile(LineFile):
     """The file while a run goes on.
 
     Args:
-        path: of the new file.
+        path: of the file.
         columns: of the run.
+        rows: how many rows of it count; None: it is a new one.
     """
 
-    def __init__(self, path: Path, columns: Columns) -> None:
+    def __init__(self, path: Path, columns: Columns, rows: int | None = None) -> None:
         names = map(one_field, columns.names + columns.discrete_names)
-        super().__init__(path, ",".join(("time", *names)) + "\n")
+        super().__init__(path, ",".join(("time", *names)) + "\n", rows)
         self._texts = [_WRITE[type_] for type_ in columns.discrete_types]
 
     def append(self, point: Point) -> None:

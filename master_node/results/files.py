@@ -39,7 +39,10 @@ FILES = (
     PLOT_FILE,
     START_FILE,
     STREAM_FILE,
-    *map(_UNFINISHED.format, (PARQUET_FILE, MAT_FILE, SUMMARY_FILE, START_FILE)),
+    *map(
+        _UNFINISHED.format,
+        (ARROW_FILE, STREAM_FILE, PARQUET_FILE, MAT_FILE, SUMMARY_FILE, START_FILE),
+    ),
 )
 """All that a run may leave and the next one in the same directory replaces."""
 
@@ -64,18 +67,29 @@ class ResultsFile(Protocol):
         """Write what is held back, or leave the file as it was; OSError."""
         ...
 
+    def synchronize(self) -> None:
+        """Make sure that what was written is on the disk; OSError."""
+        ...
+
     def close(self) -> None:
         """Make sure that it is on the disk; OSError."""
         ...
 
 
 class BatchFile(ABC):
-    """A new file that only ever grows by whole batches."""
+    """A file that only ever grows by whole batches.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        path: of the file.
+        size: how many bytes of it count; None: it is a new one.
+    """
+
+    def __init__(self, path: Path, size: int | None = None) -> None:
         self.path = path
-        self._file = path.open("xb", buffering=0)
-        self._size = 0
+        self._file = path.open("xb" if size is None else "r+b", buffering=0)
+        self._size = size or 0
+        if size is not None:
+            self._file.truncate(size)
 
     @abstractmethod
     def _batch(self) -> bytes:
@@ -89,6 +103,10 @@ class BatchFile(ABC):
         """Write the batch, or leave the file as it was; both can be repeated after an error."""
         self._write(self._batch())
         self._written()
+
+    def synchronize(self) -> None:
+        """To the disk; OSError."""
+        os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """To the disk, and no more."""
@@ -112,13 +130,17 @@ class LineFile(BatchFile):
     """Batches of lines.
 
     Args:
-        path: of the new file.
+        path: of the file.
         head: the first line.
+        rows: how many rows behind it count; None: the file is a new one.
+
+    Raises:
+        ResultsError: the file does not begin with ``head``, or has fewer rows.
     """
 
-    def __init__(self, path: Path, head: str) -> None:
-        super().__init__(path)
-        self._lines = [head]
+    def __init__(self, path: Path, head: str, rows: int | None = None) -> None:
+        super().__init__(path, None if rows is None else _end_of(path, head, rows))
+        self._lines = [] if rows is not None else [head]
         self._add = self._lines.append
 
     def _batch(self) -> bytes:
@@ -126,6 +148,23 @@ class LineFile(BatchFile):
 
     def _written(self) -> None:
         self._lines.clear()
+
+
+def _end_of(path: Path, head: str, rows: int) -> int:
+    """Where the last of ``rows`` rows ends [bytes]; lines within quotation marks go on."""
+    with path.open("rb") as file:
+        first = file.readline()
+        if first != head.encode(errors="replace"):
+            raise malformed(path, "its columns are not those of the run", 1)
+        size, found, is_quoted = len(first), 0, False
+        while found < rows:
+            line = file.readline()
+            if not line.endswith(b"\n"):
+                raise malformed(path, f"{found} rows instead of {rows}, which the checkpoint names")
+            size += len(line)
+            is_quoted ^= bool(line.count(b'"') % 2)
+            found += not is_quoted
+    return size
 
 
 @contextmanager

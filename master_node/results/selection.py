@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,18 @@ def chosen(patterns: Sequence[str], names: Sequence[str]) -> NDArray[np.bool_]:
     )
 
 
+class SelectionMemory(NamedTuple):
+    """What the choice of points remembers.
+
+    Attributes:
+        number: of points after the first.
+        passed_over: the last point, if it was not wanted.
+    """
+
+    number: int = 0
+    passed_over: Point | None = None
+
+
 class SelectedResults:
     """An observer that passes on the variables and the points that are wanted.
 
@@ -62,16 +75,28 @@ class SelectedResults:
         observer: gets what is left.
         variables: patterns, see ``chosen``.
         every: of the points after the first each ``every``-th is wanted.
+        begin: what is remembered of a run that is resumed.
     """
 
-    def __init__(self, observer: Observer, variables: Sequence[str], every: int) -> None:
+    def __init__(
+        self,
+        observer: Observer,
+        variables: Sequence[str],
+        every: int,
+        begin: SelectionMemory = SelectionMemory(),  # noqa: B008  immutable
+    ) -> None:
         self._observer = observer
         self._variables = tuple(variables)
         self._every = every
         self._outputs: NDArray[np.intp] | None = None
         self._discrete: tuple[int, ...] | None = None
-        self._number = 0
-        self._passed_over: Point | None = None
+        self._begin = begin
+        self._number, self._passed_over = begin
+
+    @property
+    def memory(self) -> SelectionMemory:
+        """What is remembered by now."""
+        return SelectionMemory(self._number, self._passed_over)
 
     def started(self, start: RunStart) -> None:
         """Pass on what is chosen of it."""
@@ -81,7 +106,7 @@ class SelectedResults:
         some_discrete = len(discrete) < len(start.discrete_names)
         self._outputs = outputs if some_outputs else None
         self._discrete = tuple(discrete.tolist()) if some_discrete else None
-        self._number, self._passed_over = 0, None
+        self._number, self._passed_over = self._begin
         self._observer.started(
             replace(
                 start,

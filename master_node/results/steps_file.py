@@ -34,12 +34,13 @@ class StepsFile(LineFile):
     """The file while a run goes on.
 
     Args:
-        path: of the new file.
+        path: of the file.
         output_names: what the limiting variable is most of the time.
+        rows: how many rows of it count; None: it is a new one.
     """
 
-    def __init__(self, path: Path, output_names: Sequence[str]) -> None:
-        super().__init__(path, ",".join(_COLUMNS) + "\n")
+    def __init__(self, path: Path, output_names: Sequence[str], rows: int | None = None) -> None:
+        super().__init__(path, ",".join(_COLUMNS) + "\n", rows)
         self._quoted = {name: one_field(name) for name in output_names}
 
     def append(self, attempt: Attempt) -> None:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from time import monotonic
 
-from master_node.observers import Attempt, Point, Points, RunEnd, RunStart
+from master_node.observers import Attempt, Outcome, Point, Points, RunEnd, RunStart
 from master_node.results.columns import Columns
 from master_node.results.csv_file import CsvFile
 from master_node.results.files import (
@@ -18,6 +18,7 @@ from master_node.results.files import (
     FILES,
     MAT_FILE,
     PARQUET_FILE,
+    PLOT_FILE,
     RESULTS_FILE,
     START_FILE,
     STEPS_FILE,
@@ -40,6 +41,8 @@ from protocol.errors import ResultsError
 FLUSH_INTERVAL = 0.5
 """Shortest time between two writes [s]: what a killed master loses at most of a fast run."""
 
+_MADE_AT_THE_END = (SUMMARY_FILE, PARQUET_FILE, MAT_FILE, PLOT_FILE)
+
 
 class ResultsWriter:
     """An observer that streams a run into a directory, with constant memory.
@@ -53,9 +56,20 @@ class ResultsWriter:
         settings: what the run was asked for; goes into the summary. ``settings["simulation"]``
             names ``estimator`` and ``order``, ``settings["results"]`` the ``formats``, by default
             ``csv``.
+        resumed: how many rows of results and of steps in the directory count, where a run is
+            resumed; None: a new run.
+        can_resume: whether a run that does not get to its end may be resumed: files of which the
+            results would be made then stay.
     """
 
-    def __init__(self, directory: Path, settings: Mapping[str, object]) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        settings: Mapping[str, object],
+        resumed: tuple[int, int] | None = None,
+        *,
+        can_resume: bool = False,
+    ) -> None:
         self._directory = directory
         self._settings = plain_mapping(settings)
         self._formats = formats_of(self._settings)
@@ -64,6 +78,24 @@ class ResultsWriter:
         self._steps: StepsFile | None = None
         self._next_flush = 0.0
         self._broken = False
+        self._resumed = resumed
+        self._keeps_stream = False
+        self._can_resume = can_resume
+        self._points, self._attempts = resumed or (0, 0)
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """How many of results and of steps were told so far."""
+        return self._points, self._attempts
+
+    def synchronize(self) -> None:
+        """Bring what was told to the disk.
+
+        Raises:
+            ResultsError: a file cannot be written.
+        """
+        self._flush()
+        self._each(lambda file: file.synchronize())
 
     def prepare(self) -> None:
         """Create the directory and try whether it can be written; old results stay for now.
@@ -83,7 +115,7 @@ class ResultsWriter:
             raise cannot_write(path, error) from error
 
     def started(self, start: RunStart) -> None:
-        """Replace old results by new files with the row of T_0.
+        """Replace old results by new files with the row of T_0, or go on where a run stood.
 
         Raises:
             ResultsError: a file cannot be written.
@@ -92,7 +124,8 @@ class ResultsWriter:
         columns = Columns.of(start)
         try:
             self._open_files(columns)
-            self._append((Point(start.start_time, start.outputs, start.discrete),))
+            if self._resumed is None:
+                self._append((Point(start.start_time, start.outputs, start.discrete),))
             self._flush()
             about = about_columns(columns, self._settings)
             write_json(self._directory / START_FILE, plain_mapping(about))
@@ -110,6 +143,7 @@ class ResultsWriter:
         """
         if self._steps is not None:
             self._steps.append(attempt)
+        self._attempts += 1
         self._append(attempt.points)
         if monotonic() >= self._next_flush:
             self._flush()
@@ -126,6 +160,8 @@ class ResultsWriter:
         errors: list[ResultsError] = []
         summary = summarize(self._start, end, self._settings)
         self._append(end.points)
+        is_complete = end.outcome in (Outcome.COMPLETED, Outcome.TERMINATED)
+        self._keeps_stream = self._can_resume and not is_complete
         for finish in (
             self._flush,
             self._close,
@@ -150,25 +186,31 @@ class ResultsWriter:
 
     def _open_files(self, columns: Columns) -> None:
         path = self._directory
+        points, attempts = self._resumed or (None, None)
         try:
-            for path in map(self._directory.joinpath, FILES):
-                path.unlink(missing_ok=True)
+            if self._resumed is None:
+                for path in map(self._directory.joinpath, FILES):
+                    path.unlink(missing_ok=True)
             if "csv" in self._formats:
                 path = self._directory / RESULTS_FILE
-                self._results.append(CsvFile(path, columns))
+                self._results.append(CsvFile(path, columns, points))
             if "arrow" in self._formats or self._made_at_the_end:
                 # pyarrow takes a tenth of a second to import, which other runs need not pay
                 from master_node.results.arrow_file import ArrowFile  # noqa: PLC0415
 
                 path = self._stream
                 hash_ = settings_sha256(self._settings)
-                self._results.append(ArrowFile(path, columns, hash_))
+                self._results.append(ArrowFile(path, columns, hash_, points))
             path = self._directory / STEPS_FILE
-            self._steps = StepsFile(path, columns.names)
+            self._steps = StepsFile(path, columns.names, attempts)
+            if self._resumed is not None:
+                for path in map(self._directory.joinpath, _MADE_AT_THE_END):
+                    path.unlink(missing_ok=True)
         except OSError as error:
             raise cannot_write(path, error) from error
 
     def _append(self, points: Points) -> None:
+        self._points += len(points)
         for file in self._results:
             for point in points:
                 file.append(point)
@@ -211,6 +253,8 @@ class ResultsWriter:
                     errors.append(error)
         if errors:
             raise errors[0]
+        if self._keeps_stream:
+            return
         with suppress(OSError):
             (self._directory / STREAM_FILE).unlink(missing_ok=True)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -36,8 +35,6 @@ def load_fmu(
             parameter.
     """
     model = read_fmu(fmu, directory, structural_parameters)
-    for remark in model.description.remarks:
-        logging.getLogger(__name__).warning("%s: %s", name, remark)
     if model.interface.is_model_exchange:
         return _model_exchange(model, name, log_all=log_all)
     return _CO_SIMULATION[model.interface.version](model, name, log_all=log_all)

@@ -1,0 +1,115 @@
+"""What a checkpoint says of the system that was run, and whether it still is the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from master_node.configuration import InputSettings, System
+from master_node.system_files import open_system
+from protocol.errors import ConfigurationError, ResultsError
+from protocol.slave import SlaveDescription
+
+
+class RunMode(NamedTuple):
+    """How slaves are run.
+
+    Attributes:
+        in_process: in this process, without a bus.
+        launch: start slaves that have a model.
+    """
+
+    in_process: bool = False
+    launch: bool = True
+
+
+def can_be_saved(system: System) -> bool:
+    """Whether a file can say what was run: it cannot hold functions and arrays out of Python."""
+    settings = [value for value in system.inputs.values() if isinstance(value, InputSettings)]
+    return all(isinstance(given, str | None) for s in settings for given in (s.table, s.function))
+
+
+def saved_system(
+    system: System, mode: RunMode, descriptions: Mapping[str, SlaveDescription]
+) -> dict[str, Any]:
+    """What was run, as plain data for JSON."""
+    tables = system.model_dump(mode="json", by_alias=True, exclude_unset=True, exclude_none=True)
+    return {
+        "tables": {k: v for k, v in tables.items() if k not in ("base", "source")},
+        "base": str(system.base),
+        "source": system.source,
+        "path": str(Path(system.source).absolute()),
+        "mode": mode._asdict(),
+        "models": {name: told.sha256 for name, told in descriptions.items()},
+        "files": {path: _sha256(system.base / path) for path in _input_files(system)},
+    }
+
+
+@contextmanager
+def reopened(saved: Mapping[str, Any]) -> Iterator[tuple[System, RunMode]]:
+    """The system again; the models of a package are there within the ``with``.
+
+    Raises:
+        ConfigurationError: it cannot be read any more, or a file of its inputs has changed.
+        ResultsError: it is malformed.
+    """
+    try:
+        path, base = Path(saved["path"]), Path(saved["base"])
+        mode = RunMode(**saved["mode"])
+        if path.suffix.lower() != ".ssp":
+            yield _system(saved, base), mode
+            return
+        with open_system(path) as opened:
+            yield _system(saved, opened.base), mode
+    except (KeyError, TypeError) as error:
+        raise ResultsError(f"the checkpoint is malformed: {error!r}") from error
+
+
+def check_models(saved: Mapping[str, Any], descriptions: Mapping[str, SlaveDescription]) -> None:
+    """Refuse models that are not those with which the run began.
+
+    Raises:
+        ConfigurationError: one has changed.
+    """
+    for name, description in descriptions.items():
+        if description.sha256 != saved["models"].get(name):
+            raise ConfigurationError(
+                f"the model {description.model} is not the one with which the run began",
+                slave=name,
+                phase="resume",
+                remedy="put the old file in its place, or run the system again from its start",
+            )
+
+
+def _system(saved: Mapping[str, Any], base: Path) -> System:
+    system = System(**saved["tables"], base=base, source=saved["source"])
+    for path, hash_ in saved["files"].items():
+        if _sha256(base / path) != hash_:
+            raise ConfigurationError(
+                f"{path} is not as it was when the run began",
+                phase="resume",
+                remedy="put the old file in its place, or run the system again from its start",
+            )
+    return system
+
+
+def _input_files(system: System) -> list[str]:
+    """Tables, and Python files with functions, relative to the system's base."""
+    names = []
+    for value in system.inputs.values():
+        if isinstance(value, InputSettings):
+            if isinstance(value.table, str):
+                names.append(value.table)
+            if isinstance(value.function, str):
+                names.append(value.function.rpartition(":")[0])
+    return sorted({name for name in names if (system.base / name).is_file()})
+
+
+def _sha256(path: Path) -> str:
+    try:
+        return sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""

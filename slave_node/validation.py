@@ -1,0 +1,413 @@
+"""``slave-node validate``: what a model can do, found out by doing it, and what follows from that.
+
+The model runs in a process of its own, which is started anew after whatever ends it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from protocol.calls import (
+    Call,
+    Configure,
+    DoStep,
+    Examine,
+    ExitInitializationMode,
+    GetDiscreteOutputs,
+    GetOutputs,
+    Initialize,
+    Reply,
+    Reset,
+    SetInputs,
+    StepResult,
+    Terminate,
+)
+from protocol.codec import decode_reply, encode_program
+from protocol.errors import DoublestepError, SlaveError
+from protocol.signals import MAX_ORDER, FloatArray
+from protocol.slave import (
+    Causality,
+    Examination,
+    InputDerivatives,
+    SlaveDescription,
+    StateKind,
+    StateVerdict,
+    StepStatus,
+)
+from slave_node.worker import ModelReference, WorkerProcess
+
+DEFAULT_STEP_SIZE = 1e-2
+_STEPS = 10
+_LADDER = (StateKind.NATIVE, StateKind.FORK, StateKind.REPLAY, StateKind.NONE)
+
+
+class Grade(StrEnum):
+    """How a finding is to be read."""
+
+    OK = "ok"
+    NOTE = "note"
+    PROBLEM = "problem"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        what: was tried.
+        grade: ``PROBLEM``: the model cannot be run; ``NOTE``: not as well as it could.
+        result: what was seen.
+        consequence: what Doublestep does about it.
+    """
+
+    what: str
+    grade: Grade
+    result: str
+    consequence: str = ""
+
+
+def validate(model: str, base: Path, step_size: float | None = None) -> Iterator[Finding]:
+    """Try a model and report, finding by finding.
+
+    Args:
+        model: see `slave_node.loading.load_slave`.
+        base: directory to which its path is relative.
+        step_size: of the trial steps [s]; None: what the model recommends, or 10 ms.
+
+    Raises:
+        ModelError: the model is missing or cannot be read.
+    """
+    if model.lower().endswith(".fmu"):
+        from slave_node.fmu.validation import description_problems  # noqa: PLC0415  only for FMUs
+
+        yield _description((base / model).resolve(), description_problems)
+    trial = _Trial(ModelReference(model, base, "validated"))
+    try:
+        description = trial.start()
+        size = step_size or description.fixed_step_size or description.default_step_size
+        yield from _Validation(trial, description, size or DEFAULT_STEP_SIZE).findings()
+    except DoublestepError as error:
+        yield Finding("load", Grade.PROBLEM, error.cause, error.remedy or "it cannot be run here")
+    finally:
+        trial.stop()
+
+
+def _description(fmu: Path, problems_of: Callable[[Path], list[str]]) -> Finding:
+    problems = problems_of(fmu)
+    if not problems:
+        return Finding("model description", Grade.OK, "valid")
+    more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
+    text = "; ".join(problem[:160] for problem in problems[:3])
+    return Finding("model description", Grade.NOTE, text + more, "it is read as far as it goes")
+
+
+class _Trial:
+    """A model in a process of its own, brought to its first communication point again and again."""
+
+    def __init__(self, reference: ModelReference) -> None:
+        self._worker = WorkerProcess(reference)
+        self._is_fresh = True
+
+    def start(self) -> SlaveDescription:
+        return self._worker.start()
+
+    def stop(self) -> None:
+        self._worker.stop()
+
+    def run(self, *calls: Call) -> Reply:
+        """Execute calls; the death of the process is the reply's error."""
+        try:
+            return decode_reply(calls, self._worker.execute(encode_program(calls)))
+        except DoublestepError as error:
+            return Reply([], error, 0.0)
+
+    def again(self, *calls: Call, configuration: Configure | None = None) -> Reply:
+        """Execute calls on the model as good as new."""
+        if not self._is_fresh and self.run(Reset()).error is not None:
+            self._worker.start()
+        self._is_fresh = False
+        if configuration is not None:
+            reply = self.run(configuration)
+            if reply.error is not None:
+                return reply
+        return self.run(*calls)
+
+
+class _Validation:
+    """The tests of one model.
+
+    Args:
+        trial: the model.
+        description: of it.
+        step_size: h [s].
+    """
+
+    def __init__(self, trial: _Trial, description: SlaveDescription, step_size: float) -> None:
+        self._trial = trial
+        self._description = description
+        self._h = step_size
+        self._inputs = tuple(
+            v.name for v in description.of(Causality.INPUT) if v.is_continuous_real
+        )
+        outputs = description.of(Causality.OUTPUT)
+        self._outputs = tuple(v.name for v in outputs if v.is_continuous_real)
+        discrete = tuple(v.name for v in outputs if v.is_discrete)
+        self._starts = np.array(
+            [[float(description.variable(name).start or 0.0) for name in self._inputs]]
+        )
+        self._begin: tuple[Call, ...] = (
+            Initialize(inputs=self._inputs, outputs=self._outputs, discrete_outputs=discrete),
+            SetInputs(self._starts),
+            ExitInitializationMode(),
+        )
+
+    def findings(self) -> Iterator[Finding]:
+        """All of them, as they come; after a problem no more."""
+        for remark in self._description.remarks:
+            yield Finding("remark", Grade.NOTE, remark)
+        for test in (self._initialization, self._steps):
+            finding = test()
+            yield finding
+            if finding.grade is Grade.PROBLEM:
+                return
+        yield self._variable_steps()
+        yield self._zero_step()
+        yield self._wrong_point()
+        yield self._input_derivatives()
+        yield self._output_derivatives()
+        yield from self._states()
+        yield self._end()
+
+    # --- the tests ------------------------------------------------------------------------------
+
+    def _initialization(self) -> Finding:
+        reply = self._trial.again(*self._begin, GetOutputs(), GetDiscreteOutputs())
+        if reply.error is not None:
+            return Finding(
+                "initialize",
+                Grade.PROBLEM,
+                f"{reply.error.phase}: {reply.error.cause}",
+                "it cannot be run with its start values; give others in parameters",
+            )
+        y: FloatArray = reply.results[-2]  # type: ignore[assignment]
+        bad = [name for name, value in zip(self._outputs, y[0], strict=True) if value - value != 0]
+        if bad:
+            return Finding(
+                "initialize", Grade.PROBLEM, f"{bad[0]} is not finite", "a run would not start"
+            )
+        return Finding(
+            "initialize", Grade.OK, f"{len(self._inputs)} inputs, {len(self._outputs)} outputs"
+        )
+
+    def _steps(self) -> Finding:
+        what = f"{_STEPS} steps of {self._h:g} s"
+        reply = self._trial.again(*self._begin, *self._equal_steps(_STEPS))
+        problem = _failure(reply)
+        if problem is None:
+            return Finding(what, Grade.OK, "taken")
+        if _last_status(reply) in (StepStatus.DISCARD, StepStatus.TERMINATED):
+            return Finding(
+                what, Grade.NOTE, problem, "a step that is not completed is tried again, smaller"
+            )
+        return Finding(
+            what, Grade.PROBLEM, problem, "try another --step-size, or look at the FMU's log"
+        )
+
+    def _variable_steps(self) -> Finding:
+        what = "steps of changing size"
+        if not self._description.capabilities.can_handle_variable_step_size:
+            fixed = self._description.fixed_step_size
+            consequence = "give step_size, or use --estimator none"
+            if fixed is not None:
+                consequence = f"communication steps are multiples of {fixed:g} s"
+            return Finding(what, Grade.NOTE, "not declared", consequence)
+        sizes = (self._h, 0.5 * self._h, 0.7 * self._h, 1.3 * self._h)
+        calls, time = [], 0.0
+        for size in sizes:
+            calls.append(DoStep(time, size))
+            time += size
+        problem = _failure(self._trial.again(*self._begin, *calls))
+        if problem is None:
+            return Finding(what, Grade.OK, "taken")
+        return Finding(what, Grade.NOTE, problem, "give step_size or step_multiple")
+
+    def _zero_step(self) -> Finding:
+        reply = self._trial.again(*self._begin, DoStep(0.0, 0.0))
+        result = "taken" if _failure(reply) is None else "refused"
+        return Finding("a step of size zero", Grade.OK, result, "none is ever asked for")
+
+    def _wrong_point(self) -> Finding:
+        reply = self._trial.again(
+            *self._begin, DoStep(0.0, self._h), DoStep(1.5 * self._h, self._h)
+        )
+        result = "not noticed" if _failure(reply) is None else "refused"
+        return Finding("a step from elsewhere", Grade.OK, result, "none is ever asked for")
+
+    def _input_derivatives(self) -> Finding:
+        what = "input derivatives"
+        kind = self._description.input_derivatives
+        if not self._inputs:
+            return Finding(what, Grade.OK, "no continuous inputs")
+        if kind is not InputDerivatives.NATIVE:
+            consequence = {
+                InputDerivatives.EMULATED: "inputs are followed in substeps",
+                InputDerivatives.NONE: "inputs are constant in each step",
+            }[kind]
+            return Finding(what, Grade.NOTE, "not taken by the model", consequence)
+        refusal = ""
+        for order in range(MAX_ORDER, 0, -1):
+            rows = np.zeros((order + 1, len(self._inputs)))
+            rows[0], rows[1:] = self._starts[0], 1e-3
+            reply = self._trial.again(*self._begin, SetInputs(rows), DoStep(0.0, self._h))
+            problem = _failure(reply)
+            if problem is None:
+                break
+            refusal = problem
+        else:
+            order = 0
+        if order == MAX_ORDER:
+            return Finding(what, Grade.OK, f"up to order {order}")
+        return Finding(
+            what,
+            Grade.NOTE,
+            f"up to order {order}, then: {refusal}",
+            "where higher ones are wanted, inputs are followed in substeps",
+        )
+
+    def _output_derivatives(self) -> Finding:
+        what = "output derivatives"
+        if not self._description.capabilities.max_output_derivative_order or not self._outputs:
+            return Finding(what, Grade.OK, "none", "input polynomials meet values only")
+        h = 1e-3 * self._h
+        reply = self._trial.again(
+            *self._begin, GetOutputs(1), DoStep(0.0, h), GetOutputs(0), DoStep(h, h), GetOutputs(0)
+        )
+        problem = _failure(reply)
+        if problem is not None:
+            return Finding(what, Grade.NOTE, problem, "leave them out: derivative_points = 0")
+        start, first, second = (r for r in reply.results if isinstance(r, np.ndarray))
+        slope = (-3.0 * start[0] + 4.0 * first[0] - second[0]) / (2.0 * h)
+        nominal = [self._description.variable(name).nominal for name in self._outputs]
+        scale = np.abs(slope) + np.abs(start[1]) + nominal
+        worst = float(np.max(np.abs(slope - start[1]) / scale))
+        if worst < 0.05:
+            return Finding(what, Grade.OK, "agree with differences", "input polynomials meet them")
+        return Finding(
+            what,
+            Grade.NOTE,
+            f"differ from differences of outputs by {worst:.0%}",
+            "wrong ones cost steps: leave them out with derivative_points = 0",
+        )
+
+    def _states(self) -> Iterator[Finding]:
+        """Each way to save states, from the model's best one down to the first that can be used."""
+        for kind in _LADDER[_LADDER.index(self._description.state_kind) :]:
+            what = f"saved states, {kind}"
+            if kind is StateKind.NONE:
+                yield Finding(
+                    what,
+                    Grade.NOTE,
+                    self._description.state_reason or "no way to save states",
+                    "steps cannot be taken back: its coupling is controlled by input defects",
+                )
+                return
+            reply = self._trial.again(
+                *self._begin,
+                SetInputs(self._moved()),
+                Examine(0.0, self._h),
+                configuration=Configure(state_kind=kind),
+            )
+            if reply.error is not None:
+                yield Finding(what, Grade.NOTE, reply.error.cause, "the next way is taken")
+                continue
+            examination: Examination = reply.results[-1]  # type: ignore[assignment]
+            yield _verdict(what, examination)
+            if examination.state_verdict in (StateVerdict.EXACT, StateVerdict.RESTARTS_SOLVER):
+                yield from _behaviour(examination)
+                return
+
+    def _moved(self) -> FloatArray:
+        """The start values a little moved: at an equilibrium nothing moves."""
+        nominal = [self._description.variable(name).nominal for name in self._inputs]
+        moved: FloatArray = self._starts + 0.01 * np.maximum(np.abs(self._starts), nominal)
+        return moved
+
+    def _end(self) -> Finding:
+        reply = self._trial.again(*self._begin, DoStep(0.0, self._h), Terminate(), Reset())
+        problem = _failure(reply)
+        if problem is None:
+            return Finding("terminate and reset", Grade.OK, "done")
+        return Finding("terminate and reset", Grade.NOTE, problem, "it is loaded anew instead")
+
+    def _equal_steps(self, number: int) -> Iterator[Call]:
+        for i in range(number):
+            yield DoStep(i * self._h, self._h)
+            yield GetOutputs()
+
+
+def _failure(reply: Reply) -> str | None:
+    """Why not all was done as it should be; None if it was."""
+    if reply.error is not None:
+        return f"{reply.error.phase}: {reply.error.cause}"
+    for result in reply.results:
+        if isinstance(result, StepResult) and result.status is not StepStatus.OK:
+            return f"do_step: {result.status} at t={result.time:g} s"
+        if isinstance(result, np.ndarray) and not np.isfinite(result).all():
+            return "an output is not finite"
+    return None
+
+
+def _last_status(reply: Reply) -> StepStatus | None:
+    last = reply.results[-1] if reply.results else None
+    return last.status if isinstance(last, StepResult) and reply.error is None else None
+
+
+def _verdict(what: str, examination: Examination) -> Finding:
+    verdict, reason = examination.state_verdict, examination.state_reason
+    match verdict:
+        case StateVerdict.EXACT:
+            return Finding(what, Grade.OK, "exact to the bit", "steps can be taken back")
+        case StateVerdict.RESTARTS_SOLVER:
+            result = f"repeats, but restarts the solver: {reason} ({examination.difference:.1g})"
+            return Finding(what, Grade.NOTE, result, "used, with a warning")
+        case StateVerdict.NOT_TESTED:
+            return Finding(what, Grade.NOTE, f"not tested: {reason}", "used, with a warning")
+        case _:
+            return Finding(what, Grade.NOTE, f"{verdict}: {reason}", "the next way is taken")
+
+
+def _behaviour(examination: Examination) -> Iterator[Finding]:
+    clock = examination.internal_clock
+    if clock is not None:
+        yield Finding(
+            "internal clock",
+            Grade.NOTE,
+            f"outputs move only at multiples of {clock:g} s",
+            "communication steps are multiples of that",
+        )
+    dependence = examination.step_dependence
+    if dependence > 1.0:
+        largest = examination.largest_substep
+        yield Finding(
+            "one step against two",
+            Grade.NOTE,
+            f"differ by {dependence:.2g} times the tolerance 1e-4",
+            "use EST_Rich" if largest is None else f"its steps are split into {largest:.2g} s",
+        )
+    else:
+        yield Finding("one step against two", Grade.OK, "agree")
+
+
+def is_usable(findings: list[Finding]) -> bool:
+    """Whether the model can be run."""
+    return all(finding.grade is not Grade.PROBLEM for finding in findings)
+
+
+def unusable(model: str) -> SlaveError:
+    """What the command ends with otherwise."""
+    return SlaveError(f"{model} cannot be run", remedy="see the problem in the report")

@@ -1,0 +1,321 @@
+"""A run that was broken off goes on where it stood: its files end up the same, byte for byte."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from master_node import Result, System, load_system, resume, simulate
+from master_node.controlled_run import Position
+from master_node.numerics.discontinuities import Bracket
+from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
+from master_node.numerics.order_control import OrderMemory
+from master_node.observers import Attempt
+from master_node.outputs import Outputs
+from master_node.plain_values import from_plain, to_plain
+from protocol.errors import ConfigurationError, InterruptedRunError, ResultsError
+from tests.quarter_car_case import EXAMPLES
+from tests.test_processes import (
+    Start,
+    has_stepped,
+    slave_processes,
+    start,
+    system_file,
+    wait_until,
+    worker_of,
+)
+
+__all__ = ["start"]
+
+pytestmark = pytest.mark.usefixtures("no_process_left")
+
+TRAPPED = f"{Path(__file__).parent / 'trap_models.py'}:Trapped"
+
+
+class Interrupt:
+    """An observer that is Ctrl-C after some attempts: at any moment between two requests."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def started(self, _: object) -> None:
+        """Nothing."""
+
+    def attempted(self, _: Attempt) -> None:
+        """Count down."""
+        self.number -= 1
+        if not self.number:
+            raise KeyboardInterrupt
+
+    def ended(self, _: object) -> None:
+        """Nothing."""
+
+
+def car(folder: Path, simulation: str, results: str = "", **models: Any) -> System:
+    """The quarter car with these settings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = system_file(folder, simulation=simulation, **models)
+    with file.open("a") as text:
+        text.write(f"[results]\n{results}")
+    return load_system(file)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files with rows."""
+    return {name: (folder / name).read_bytes() for name in ("results.csv", "steps.csv")}
+
+
+def interrupted(system: System, folder: Path, *numbers: int) -> None:
+    """Begin a run, break it off after so many attempts each, and bring it to its end."""
+    first, *rest = numbers
+    with pytest.raises(InterruptedRunError):
+        simulate(system, output=folder, in_process=True, observers=(Interrupt(first),))
+    for number in rest:
+        with pytest.raises(InterruptedRunError):
+            resume(folder, observers=(Interrupt(number),))
+    resume(folder)
+
+
+COUNTERS = (
+    "communication_steps",
+    "rejected_double_steps",
+    "discontinuities",
+    "outcome",
+    "settings",
+)
+JUMP = "stop_time = 1.0\nevents = [0.5]\n"
+
+
+@pytest.mark.parametrize(
+    ("simulation", "numbers"),
+    [
+        ("stop_time = 1.0\n", (3, 5, 20)),
+        ("stop_time = 1.0\nestimator = 'rich'\nrelative_tolerance = 1e-6\n", (1, 20, 17)),
+        ("stop_time = 1.0\nsequence = 'gauss-seidel'\norder = 2\n", (12, 13)),
+        (JUMP, (15, 6)),
+        (JUMP + "output_interval = 0.013\n", (15, 6)),
+        ("stop_time = 0.2\nestimator = 'none'\noutput_interval = 0.013\n", (50, 100)),
+        ("stop_time = 1.0\npreset = 'paper'\nderivative_points = 0\n", (9, 9)),
+        ("stop_time = 0.2\ncheckpoint_interval = 1e-6\nlargest_step_size = 1e-3\n", (60, 30)),
+    ],
+)
+@pytest.mark.parametrize("every", [1, 3])
+def test_an_interrupted_run_goes_on_to_the_same_bits(
+    simulation: str, numbers: tuple[int, ...], every: int, tmp_path: Path
+) -> None:
+    """Law: history, controller, order, brackets, grids and counters go on as if nothing was."""
+    system = car(tmp_path, simulation, f"every = {every}\n")
+    simulate(system, output=tmp_path / "whole", in_process=True)
+    whole = Result.load(tmp_path / "whole")
+    assert len(whole.steps) > sum(numbers)
+    interrupted(system, tmp_path / "parts", *numbers)
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+    summary = Result.load(tmp_path / "parts").summary
+    for name in COUNTERS:
+        assert summary[name] == whole.summary[name]
+    assert not (tmp_path / "parts" / "checkpoint").exists()
+
+
+@pytest.mark.parametrize("which", ["wheel", "both"])
+def test_slaves_without_rollback(which: str, tmp_path: Path, capability_dir: Path) -> None:
+    """What cannot be saved is replayed from T_0: mixed runs, and runs where none can go back."""
+    names = {"wheel": ("wheel",), "both": ("chassis", "wheel")}[which]
+    models = {name: capability_dir / f"{name}_no_state.fmu" for name in names}
+    system = car(tmp_path, "stop_time = 0.5\n", **models)
+    whole = simulate(system, output=tmp_path / "whole", in_process=True)
+    attempts = len(whole.steps)
+    assert attempts > 12
+    interrupted(system, tmp_path / "parts", attempts // 3, attempts // 4)
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+
+
+def test_all_formats(tmp_path: Path) -> None:
+    """Arrow, Parquet and MAT of a resumed run hold the same rows; nothing else is left."""
+    system = car(tmp_path, JUMP, "formats = ['csv', 'arrow', 'parquet', 'mat']\n")
+    simulate(system, output=tmp_path / "whole", in_process=True)
+    interrupted(system, tmp_path / "parts", 12, 5)
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+    for suffix in ("arrow", "parquet", "mat"):
+        a = Result.load(tmp_path / "whole" / f"results.{suffix}")
+        b = Result.load(tmp_path / "parts" / f"results.{suffix}")
+        assert a.time.tobytes() == b.time.tobytes()
+        assert a.outputs.tobytes() == b.outputs.tobytes()
+    names = [{p.name for p in (tmp_path / name).iterdir()} for name in ("whole", "parts")]
+    assert names[0] == names[1]
+
+
+def test_parquet_alone(tmp_path: Path) -> None:
+    """The stream from which it is made outlives the interruption, and not the end."""
+    system = car(tmp_path, "stop_time = 0.3\n", "formats = ['parquet']\n")
+    whole = simulate(system, in_process=True)
+    interrupted(system, tmp_path / "parts", 4, 3)
+    result = Result.load(tmp_path / "parts")
+    assert result.outputs.tobytes() == whole.outputs.tobytes()
+    files = {path.name for path in (tmp_path / "parts").iterdir()}
+    assert files == {"results.parquet", "steps.csv", "summary.json"}
+
+
+# ---- Real processes -----------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="uses signals and /proc")
+@pytest.mark.parametrize("accident", ["kill master", "interrupt master"])
+def test_a_master_that_is_killed(accident: str, start: Start, tmp_path: Path) -> None:
+    """SIGKILL and Ctrl-C in mid step: slaves end with it, results are readable, resume goes on."""
+    settings = "stop_time = 0.5\nlargest_step_size = 1e-3\ncheckpoint_interval = 0.1\n"
+    whole = car(tmp_path / "whole", settings)
+    simulate(whole, output=tmp_path / "whole" / "out", in_process=True)
+    out = tmp_path / "out"
+    file = system_file(
+        tmp_path,
+        TRAPPED,
+        simulation=settings,
+        chassis_parameters={"traps": f"0.31 {accident}", "folder": tmp_path},
+    )
+    master = start("master_node", "run", file, "--no-plot", "--output", out)
+    assert master.wait() == (-signal.SIGKILL if accident == "kill master" else 130), master.text
+    before = Result.load(out)
+    assert len(before.time) > 1
+    assert before.time[-1] < 0.32
+    again = start("master_node", "resume", out, "--no-plot")
+    assert again.wait() == 0, again.text
+    assert contents(out) == contents(tmp_path / "whole" / "out")
+    assert not (out / "checkpoint").exists()
+    refused = start("master_node", "resume", out)
+    assert refused.wait() == 7
+    assert "holds no checkpoint" in refused.text
+
+
+@pytest.mark.skipif(os.name != "posix", reason="uses signals")
+def test_fmus_and_a_ctrl_c_in_mid_run(start: Start, tmp_path: Path, fmu_dir: Path) -> None:
+    """Serialised states of FMUs lead a resumed run to the bits of one that was not broken off."""
+    settings = "stop_time = 4.0\nlargest_step_size = 1e-3\n"
+    models = {name: fmu_dir / f"{name}.fmu" for name in ("chassis", "wheel")}
+    system = car(tmp_path, settings, **models)
+    out = tmp_path / "out"
+    master = start("master_node", "run", tmp_path / "car.toml", "--no-plot", "--output", out)
+    master.wait_for("simulating")
+    wait_until(lambda: has_stepped(out))
+    processes = [worker_of(node) for node in slave_processes(master).values()]
+    assert len(processes) == 2
+    master.send(signal.SIGINT)
+    assert master.wait() == 130
+    assert Result.load(out).time[-1] < 4.0
+    resume(out)
+    simulate(system, output=tmp_path / "whole", in_process=True)
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+# ---- What cannot be resumed ---------------------------------------------------------------------
+
+
+def broken_off(tmp_path: Path, simulation: str = "stop_time = 0.3\n", **models: Any) -> Path:
+    """A run that was interrupted."""
+    system = car(tmp_path, simulation, **models)
+    with pytest.raises(InterruptedRunError):
+        simulate(system, output=tmp_path / "out", in_process=True, observers=(Interrupt(4),))
+    return tmp_path / "out"
+
+
+def test_a_model_that_has_changed(tmp_path: Path) -> None:
+    """Another model would go on to other results: refused, and what is there stays."""
+    model = tmp_path / "quarter_car.py"
+    shutil.copy(EXAMPLES / "quarter_car.py", model)
+    out = broken_off(tmp_path, chassis=f"{model}:Chassis")
+    before = contents(out)
+    model.write_text(model.read_text() + "\n# another one\n")
+    with pytest.raises(ConfigurationError, match=r"^chassis: resume: the model .* is not the one"):
+        resume(out)
+    assert contents(out) == before
+    assert (out / "checkpoint" / "run.zip").exists()
+
+
+@pytest.mark.parametrize("what", ["calls", "zip", "rows", "system"])
+def test_damaged_files(what: str, tmp_path: Path) -> None:
+    """Each is named, and nothing is made up."""
+    out = broken_off(tmp_path)
+    folder = out / "checkpoint"
+    if what == "calls":
+        path = folder / "wheel.0.calls"
+        path.write_bytes(b"?" + path.read_bytes()[1:])
+    elif what == "zip":
+        path = folder / "run.zip"
+        path.write_bytes(path.read_bytes()[:100])
+    elif what == "rows":
+        path = out / "results.csv"
+        path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
+    else:
+        path = folder / "system.json"
+        path.write_text("{}")
+    with pytest.raises(ResultsError, match=path.name if what != "system" else "malformed"):
+        resume(out)
+
+
+def test_no_checkpoint_was_wanted(tmp_path: Path) -> None:
+    """``checkpoint_interval = 0``: none is written, and resume says what to do."""
+    out = broken_off(tmp_path, "stop_time = 0.3\ncheckpoint_interval = 0\n")
+    assert not (out / "checkpoint").exists()
+    with pytest.raises(ResultsError, match=r"holds no checkpoint.*checkpoint_interval"):
+        resume(out)
+
+
+def test_a_new_run_replaces_the_checkpoint(tmp_path: Path) -> None:
+    """What is resumed is the last run in a directory, not one before it."""
+    out = broken_off(tmp_path)
+    system = load_system(tmp_path / "car.toml").with_simulation(stop_time=0.2)
+    simulate(system, output=out, in_process=True)
+    with pytest.raises(ResultsError, match="holds no checkpoint"):
+        resume(out)
+
+
+# ---- Plain values -------------------------------------------------------------------------------
+
+
+def test_a_position_reads_back_to_the_same_bits() -> None:
+    """Negative zero, infinities, NaN, layouts of arrays and types of numbers are kept."""
+    array = np.array([[0.1, -0.0], [np.inf, 1e-310]])
+    position = Position(
+        CouplingHistory((0.3, np.float64(0.2)), (array, np.asfortranarray(array)), 5),  # type: ignore[arg-type]
+        Outputs(array[:, :1].copy(), (1, 1.0, True, "text", b"\x00bytes", (1, 2.0))),
+        1e-3,
+        OrderMemory(InputPolynomial(2, 1), 3, None, 1, array),
+        bracket=Bracket(0.5, (1e-3, float("inf"))),
+        smooth=(1e-3, float("nan")),
+    )
+    again = from_plain(Position, json.loads(json.dumps(to_plain(position))))
+    assert_same(again, position)
+
+
+def assert_same(a: Any, b: Any) -> None:
+    """Type by type and bit by bit."""
+    assert type(a) is type(b)
+    if isinstance(a, np.ndarray):
+        assert a.tobytes() == b.tobytes()
+        assert (a.shape, a.strides, a.dtype) == (b.shape, b.strides, b.dtype)
+    elif isinstance(a, Mapping):
+        assert a == b
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_same(x, y)
+    elif hasattr(a, "__slots__") and not isinstance(a, float):
+        for name in a.__slots__:
+            assert_same(getattr(a, name), getattr(b, name))
+    else:
+        assert repr(a) == repr(b)
+
+
+@pytest.mark.parametrize("plain", [{"order": 1}, 3, {"times": [0.1], "inputs": 7, "depth": 1}])
+def test_what_is_no_value_is_refused(plain: object) -> None:
+    """Never anything else than the type that was asked for."""
+    with pytest.raises(ValueError, match="not a CouplingHistory"):
+        from_plain(CouplingHistory, plain)
