@@ -19,7 +19,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from master_node.agents import Sent
+from master_node.agent_models import Sent
 from master_node.numerics.extrapolation import InputPolynomial
 from master_node.observers import Attempt, RunEnd, RunStart, SlaveStatistics, slowest
 

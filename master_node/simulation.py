@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from master_node.agents import Uploading
+from master_node.agent_models import Uploading
 from master_node.checkpoint_files import CheckpointStore
 from master_node.checkpoints import Checkpoints, ResultPosition, Resumed
 from master_node.co_simulation import CoSimulation, check_capabilities

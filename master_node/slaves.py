@@ -14,7 +14,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from secrets import token_hex
 
-from master_node.agents import Agents, Uploading
+from master_node.agent_models import Uploading
+from master_node.agents import Agents
 from master_node.announcement import announce_run
 from master_node.configuration import System
 from master_node.launcher import Launcher, Starter

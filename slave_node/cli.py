@@ -212,10 +212,11 @@ def router(
 
 
 @app.command()
-def check(
+def check(  # noqa: PLR0917  options of the command line
     name: Annotated[str, typer.Argument(help="Slave to look for [default: a router].")] = "",
+    agent: Annotated[bool, typer.Option("--agent", help="NAME is an agent.")] = False,
     connect: Annotated[
-        str, typer.Option(help="Router, or the slave itself where it listens.")
+        str, typer.Option(help="Router, or the slave or agent itself where it listens.")
     ] = DEFAULT_ENDPOINT,
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
@@ -238,7 +239,7 @@ def check(
         check_name(name)
     bus = ZenohBus(endpoints, timeout=timeout)
     try:
-        check_alive(bus, name)
+        check_alive(bus, name, agent=agent)
     finally:
         bus.close()
 

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from master_node import progress as progress_module
-from master_node.agents import Sent
+from master_node.agent_models import Sent
 from master_node.observers import Attempt, Outcome, RunEnd, RunStart, SlaveStatistics, Statistics
 from master_node.progress import ProgressBar, UploadBar, summary_table
 from master_node.results import summarize
