@@ -109,7 +109,7 @@ def test_a_slave_stopped_for_ever_ends_the_run(  # noqa: PLR0917
         tmp_path,
         fmu_dir / "chassis.fmu",
         fmu_dir / "wheel.fmu",
-        simulation=FOREVER,
+        simulation=FOREVER + 'recovery = "off"\n',
         bus=bus,
     )
     master = start("master_node", "run", file, "--output", tmp_path / "out")
