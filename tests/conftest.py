@@ -17,12 +17,17 @@ from types import ModuleType
 
 import psutil
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 # A slow moment of the machine is no counterexample.
-settings.register_profile("doublestep", deadline=None)
+settings.register_profile(
+    "doublestep",
+    deadline=None,
+    max_examples=50,
+    suppress_health_check=[HealthCheck.too_slow],
+)
 settings.load_profile("doublestep")
 
 _MARK = "DOUBLESTEP_TEST_SESSION"
