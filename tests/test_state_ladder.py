@@ -21,7 +21,7 @@ from protocol.calls import Configure, Describe
 from protocol.errors import ModelError, SlaveError
 from protocol.slave import SlaveDescription, StateKind
 from slave_node.executor import Executor
-from slave_node.loading import describe_model, load_executor, load_slave
+from slave_node.loading import describe_model, load_executor
 from slave_node.states.ladder import choose
 from tests.quarter_car_case import CHASSIS, DISPLACEMENT, EXAMPLES, WHEEL, car, run_slaves
 from tests.state_programs import MODELS, begin, loaded
@@ -118,21 +118,6 @@ def test_a_state_that_is_not_to_be_saved_is_not(fmu_dir: Path) -> None:
         assert slave.get_outputs(0)[0, 0] == 0.0
 
 
-def test_a_configuration_with_anything_else_is_refused(fmu_dir: Path, tmp_path: Path) -> None:
-    """Whatever the state kind."""
-    for kind in ("native", "replay"):
-        scratch = tmp_path / kind
-        scratch.mkdir()
-        with pytest.raises(ModelError, match="cannot be run as"):
-            load_slave(
-                str(fmu_dir / "wheel.fmu"),
-                Path(),
-                "x",
-                scratch,
-                configuration=Configure(kind, largest_substep=0.1),
-            )
-
-
 # ---- Who chooses --------------------------------------------------------------------------------
 
 
@@ -182,7 +167,8 @@ def test_the_master_tells_all_slaves_and_so_undoes_what_the_last_one_told(
         executors[name] = executor(fmu_dir / f"{name}.fmu", scratch)
     executors["wheel"].execute([Configure("none")])
     links = {name: LocalSlave(each) for name, each in executors.items()}
-    descriptions = configure(links, system)
+    loaded = {name: each.description for name, each in executors.items()}
+    descriptions = configure(links, system, loaded)
     assert {n: d.state_kind for n, d in descriptions.items()} == {
         "chassis": StateKind.REPLAY,
         "wheel": StateKind.NATIVE,
