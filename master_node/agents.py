@@ -1,39 +1,29 @@
-"""Slaves that agents start on their hosts: which agent, which model there, and what became of them.
-
-A model is the same when its SHA-256 is: it is looked for on the agent by that, and sent only when
-it is not there and the agent takes it.
-"""
+"""Slaves that agents start on their hosts: which agent it is, and what became of them."""
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import socket
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from time import monotonic, sleep
-from typing import Self, TypeVar
+from typing import Self
 
+from master_node.agent_models import ModelPlacing, Uploading, WantedModel, wanted_model
+from master_node.agent_requests import SeenAgent, ask_agent
 from master_node.configuration import SlaveSettings, System
 from master_node.remote_slave import orphan_time
 from protocol.agents import (
-    CHUNK_BYTES,
     LICENCE,
-    AgentModel,
     AgentStatus,
     Done,
-    ModelList,
     OutputRequest,
-    Record,
     SlaveOutput,
     SlaveStarted,
     StartSlave,
     StopRun,
-    Upload,
-    UploadState,
 )
 from protocol.bus import Bus, PendingReply
 from protocol.codec import decode_record, encode_record
@@ -47,11 +37,9 @@ from protocol.errors import (
     SlaveLostError,
 )
 from protocol.keys import (
-    MODELS,
     OUTPUT,
     START,
     STOP,
-    UPLOAD,
     AgentKey,
     SlaveKey,
     alive_agents,
@@ -64,57 +52,11 @@ log = logging.getLogger("master_node")
 
 _TOKEN_TIME = 1.0
 _STATUS_TIME = 1.0
-_MODELS_TIME = 60.0  # an agent reads files that are new to it
 _START_TIME = 30.0
 _STOP_TIME = 10.0
-_CHUNK_TIME = 30.0
 _PAUSE = 0.1
 _ARRIVAL_TIME = 0.6  # who waits for a master tries again every 0.2 s
 _CHECK_PERIOD = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class Sent:
-    """How far a model is on its way.
-
-    Attributes:
-        slave: for which it is.
-        agent: to which it goes.
-        model: file name.
-        sent, size: [bytes].
-    """
-
-    slave: str
-    agent: str
-    model: str
-    sent: int
-    size: int
-
-
-Uploading = Callable[[Sent], None]
-"""Told of every piece that was sent."""
-
-
-@dataclass(frozen=True)
-class _Wanted:
-    """A slave that is to be started, and its model as it is known here.
-
-    Attributes:
-        slave: its name.
-        settings: its table.
-        file: the model's file here; None: there is none.
-        name: of the model's file, without folders.
-        python_class: of a Python model, with its colon; empty for an FMU.
-        sha256, size: of ``file``; empty and 0 without it.
-    """
-
-    slave: str
-    settings: SlaveSettings
-    file: Path | None
-    name: str
-    python_class: str
-    sha256: str = ""
-    size: int = 0
 
 
 @dataclass(frozen=True)
@@ -126,17 +68,8 @@ class _Placed:
     sha256: str
 
 
-@dataclass(frozen=True)
-class _Seen:
-    key: AgentKey
-    status: AgentStatus
-
-
 class _UnsuitableError(Exception):
-    """An agent cannot start a slave; another one may. Its text says why."""
-
-
-_R = TypeVar("_R", bound=Record)
+    """No agent has the name and the labels."""
 
 
 class Agents:
@@ -155,7 +88,7 @@ class Agents:
         self._bus = bus
         self._run = run
         self._system = system
-        self._uploading = uploading
+        self._models = ModelPlacing(bus, system.bus.reconnect_time, uploading)
         self._arrived = monotonic() + _ARRIVAL_TIME
         self._deadline = monotonic() + system.bus.discovery_timeout
         self._placed: dict[str, _Placed] = {}
@@ -184,14 +117,14 @@ class Agents:
             SlaveBusyError: all licences are taken; says by whom.
             ProtocolError: two agents of one name.
         """
-        wanted = self._wanted(name)
+        wanted = wanted_model(self._system, name)
+        settings = self._system.slaves[name]
         waiting = False
         sleep(max(0.0, self._arrived - monotonic()))  # choose among all of them
         while True:
             seen = self._seen()
-            suitable = _suitable(seen, wanted.settings)
             try:
-                return self._start_on_first(suitable, wanted)
+                return self._start_on_first(_suitable(seen, settings), wanted)
             except SlaveBusyError as error:
                 if monotonic() > self._deadline:
                     raise error.located(slave=name, phase="start") from None
@@ -201,11 +134,11 @@ class Agents:
             except (SlaveLostError, DeadlineError) as error:
                 if monotonic() > self._deadline:
                     raise error.located(slave=name, phase="start") from None
-            except ConfigurationError as error:
+            except (ConfigurationError, ProtocolError) as error:
                 raise error.located(slave=name, phase="start") from None
             except _UnsuitableError:
                 if monotonic() > self._deadline:
-                    raise self._nobody(wanted, seen) from None
+                    raise self._nobody(name, settings, seen) from None
             sleep(_PAUSE)
 
     def restart(self, name: str) -> SlaveKey:
@@ -254,7 +187,9 @@ class Agents:
             return self._ended.get(name)
         try:
             request = OutputRequest(self._run, name)
-            output = self._ask(placed.key, OUTPUT, request, SlaveOutput, _STATUS_TIME)
+            output = ask_agent(
+                self._bus, placed.key, OUTPUT, request, SlaveOutput, timeout=_STATUS_TIME
+            )
         except DoublestepError:
             return None
         if output.exit_code is None:
@@ -304,7 +239,7 @@ class Agents:
             except DoublestepError as error:
                 log.warning("an agent did not end its slaves: %s", printable(str(error)))
 
-    def _seen(self) -> list[_Seen]:
+    def _seen(self) -> list[SeenAgent]:
         """The agents on the bus that answer, all asked at once."""
         tokens = self._bus.alive(alive_agents(), _TOKEN_TIME)
         keys = [key for key in map(AgentKey.from_alive, tokens) if key is not None]
@@ -315,12 +250,12 @@ class Agents:
         seen = []
         for key, reply in pending:
             try:
-                seen.append(_Seen(key, decode_record(AgentStatus, reply.result())))
+                seen.append(SeenAgent(key, decode_record(AgentStatus, reply.result())))
             except DoublestepError as error:
                 log.warning("agent %s: %s", printable(key.name), printable(str(error)))
         return seen
 
-    def _start_on_first(self, suitable: Sequence[_Seen], wanted: _Wanted) -> SlaveKey:
+    def _start_on_first(self, suitable: Sequence[SeenAgent], wanted: WantedModel) -> SlaveKey:
         """Try them in turn; raises the most hopeful of their reasons."""
         if not suitable:
             raise _UnsuitableError
@@ -337,8 +272,8 @@ class Agents:
         first.cause = printable("; ".join(reason.cause for reason in reasons))
         raise first
 
-    def _start_on(self, seen: _Seen, wanted: _Wanted) -> SlaveKey:
-        requires = wanted.settings.requires
+    def _start_on(self, seen: SeenAgent, wanted: WantedModel) -> SlaveKey:
+        requires = self._system.slaves[wanted.slave].requires
         licence = requires.get(LICENCE, "")
         for counted in seen.status.licences:
             if counted.name == licence and not counted.free:  # before a model is sent for nothing
@@ -352,7 +287,7 @@ class Agents:
                     + ", ".join(counted.holders),
                     remedy="wait for these to end, or raise discovery_timeout",
                 )
-        model, sha256 = self._model_on(seen, wanted)
+        model, sha256 = self._models.place(seen, wanted)
         request = StartSlave(
             run=self._run,
             host=socket.gethostname(),
@@ -364,132 +299,15 @@ class Agents:
             restart=self._restarts.get(wanted.slave, 0),
         )
         self._used.add(seen.key)
-        started = self._ask(seen.key, START, request, SlaveStarted, _START_TIME)
+        started = ask_agent(self._bus, seen.key, START, request, SlaveStarted, timeout=_START_TIME)
         self._placed[wanted.slave] = _Placed(seen.status, seen.key, sha256)
-        log.info("%s is started by agent %s on %s", wanted.slave, seen.key.name, seen.status.host)
+        where = printable(f"{seen.key.name} on {seen.status.host}")
+        log.info("%s is started by agent %s", wanted.slave, where)
         return SlaveKey(wanted.slave, started.instance)
 
-    def _model_on(self, seen: _Seen, wanted: _Wanted) -> tuple[str, str]:
-        """What to call the model on that agent, and its SHA-256 if it is known."""
-        if wanted.python_class and not wanted.name.endswith(".py"):
-            return f"{wanted.name}{wanted.python_class}", ""
-        if wanted.python_class and not seen.status.python:
-            raise ModelError(
-                "it starts no Python models",
-                remedy="start it with --allow-python, or export the model as an FMU",
-            )
-        models = self._ask(seen.key, MODELS, Done(), ModelList, _MODELS_TIME).models
-        named = [model for model in models if model.name == wanted.name]
-        if wanted.python_class:
-            return self._python_model_on(named, wanted)
-        if wanted.file is None:
-            if not named:
-                raise ModelError(
-                    f"it has no model {wanted.name}, and there is none here",
-                    remedy=f"give the path of {wanted.name} here, or copy it into the agent's "
-                    "--models directory",
-                )
-            return named[0].sha256, named[0].sha256
-        if not any(model.sha256 == wanted.sha256 for model in models):
-            self._may_send(seen.status, named, wanted)
-            self._send(seen, wanted, wanted.file)
-        return wanted.sha256, wanted.sha256
-
-    @staticmethod
-    def _python_model_on(named: Sequence[AgentModel], wanted: _Wanted) -> tuple[str, str]:
-        """A Python file is never sent: it would be a program for that host."""
-        if not named:
-            raise ModelError(
-                f"it has no file {wanted.name}",
-                remedy="copy it into the agent's --models directory",
-            )
-        if wanted.sha256 and wanted.sha256 != named[0].sha256:
-            raise ModelError(
-                f"its {wanted.name} is another one: SHA-256 {named[0].sha256}, here "
-                f"{wanted.sha256}",
-                remedy="copy the one from here into the agent's --models directory",
-            )
-        return f"{wanted.name}{wanted.python_class}", named[0].sha256
-
-    @staticmethod
-    def _may_send(agent: AgentStatus, named: Sequence[AgentModel], wanted: _Wanted) -> None:
-        if wanted.size <= agent.upload_limit:
-            return
-        other = f"; its {wanted.name} is another one" if named else ""
-        limit = (
-            f"it takes only models up to {agent.upload_limit} bytes, and this one has {wanted.size}"
-            if agent.upload_limit
-            else "models may not be sent to it"
-        )
-        raise ModelError(
-            f"it has no model with the SHA-256 of {wanted.name}, {wanted.sha256}{other}, and "
-            f"{limit}",
-            remedy=f"copy {wanted.name} into its --models directory, or "
-            + (
-                "raise its --upload-limit" if agent.upload_limit else "start it with --allow-upload"
-            ),
-        )
-
-    def _send(self, seen: _Seen, wanted: _Wanted, file: Path) -> None:
-        """Send the pieces that are not there yet; goes on after a lost connection."""
-        log.info("sending %s (%d bytes) to agent %s", wanted.name, wanted.size, seen.key.name)
-        try:
-            with file.open("rb") as source:
-                state = self._piece(seen.key, Upload(wanted.sha256, wanted.size, 0, b""))
-                while not state.complete:
-                    offset = state.received
-                    source.seek(offset)
-                    data = source.read(CHUNK_BYTES)
-                    state = self._piece(seen.key, Upload(wanted.sha256, wanted.size, offset, data))
-                    if not state.complete and state.received <= offset:
-                        raise ProtocolError(
-                            f"agent {seen.key.name} did not take the piece at {offset}"
-                        )
-                    self._tell(seen, wanted, state.received)
-        except OSError as error:
-            raise ModelError(f"{file} cannot be read: {error}") from error
-
-    def _tell(self, seen: _Seen, wanted: _Wanted, sent: int) -> None:
-        if self._uploading is not None:
-            self._uploading(Sent(wanted.slave, seen.key.name, wanted.name, sent, wanted.size))
-
-    def _piece(self, key: AgentKey, piece: Upload) -> UploadState:
-        deadline = monotonic() + self._system.bus.reconnect_time
-        while True:
-            try:
-                return self._ask(key, UPLOAD, piece, UploadState, _CHUNK_TIME)
-            except SlaveLostError:
-                if monotonic() > deadline:
-                    raise
-            sleep(_PAUSE)
-
-    def _ask(
-        self, key: AgentKey, verb: str, record: Record, answer: type[_R], timeout: float
-    ) -> _R:
-        reply = self._bus.caller(key.verb(verb), timeout).request(encode_record(record))
-        return decode_record(answer, reply)
-
-    def _wanted(self, name: str) -> _Wanted:
-        settings = self._system.slaves[name]
-        model = str(settings.model)
-        place, colon, python_class = model.rpartition(":")
-        is_python = bool(colon) and not model.lower().endswith(".fmu")
-        path = place if is_python else model
-        python_class = f":{python_class}" if is_python else ""
-        file_name = path.replace("\\", "/").rpartition("/")[2]
-        file = self._system.base / path
-        try:
-            if (is_python and not path.endswith(".py")) or not file.is_file():
-                return _Wanted(name, settings, None, file_name, python_class)
-            with file.open("rb") as source:
-                digest = hashlib.file_digest(source, "sha256").hexdigest()
-            size = file.stat().st_size
-        except OSError as error:
-            raise ModelError(f"{file} cannot be read: {error}", slave=name) from error
-        return _Wanted(name, settings, file, file_name, python_class, digest, size)
-
-    def _nobody(self, wanted: _Wanted, seen: Sequence[_Seen]) -> SlaveLostError:
-        settings = wanted.settings
+    def _nobody(
+        self, name: str, settings: SlaveSettings, seen: Sequence[SeenAgent]
+    ) -> SlaveLostError:
         there = "; ".join(
             printable(
                 f"{s.key.name} on {s.status.host}, which "
@@ -507,14 +325,14 @@ class Agents:
         return SlaveLostError(
             f"no agent with {', '.join(asked)} within {self._system.bus.discovery_timeout:g} s; "
             f"found on the bus: {there or 'no agent at all'}",
-            slave=wanted.slave,
+            slave=name,
             phase="discovery",
             remedy="start one with `slave-node agent --models DIR --name NAME --label NAME=VALUE`, "
             "or check --connect and --listen on both sides",
         )
 
 
-def _suitable(seen: Sequence[_Seen], settings: SlaveSettings) -> list[_Seen]:
+def _suitable(seen: Sequence[SeenAgent], settings: SlaveSettings) -> list[SeenAgent]:
     """The agents that a slave may be started by, the best first.
 
     Raises:

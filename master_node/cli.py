@@ -13,16 +13,20 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from protocol.credentials import Credentials, Role
+from protocol.endpoints import LOOPBACK
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
+from protocol.logs import LogFormat, about, configure_logs, logs_json
 
 if TYPE_CHECKING:  # each command imports what it needs
     from master_node.study.directory import StudyDirectory
     from master_node.study.runner import Runner
+if TYPE_CHECKING:
+    from master_node.observers import Observer
 
 app = typer.Typer(
     help="Co-simulation master with error-controlled communication step sizes.",
@@ -35,6 +39,8 @@ app = typer.Typer(
 log = logging.getLogger("master_node")
 
 _END_TIME = 5.0
+_TEXT_FORMAT = "%(levelname)s: %(message)s"
+_ENDING = (signal.SIGINT, signal.SIGTERM)
 
 Tls = Annotated[
     Path | None,
@@ -48,6 +54,11 @@ Listen = Annotated[
     list[str] | None, typer.Option(help="Where slaves connect to while no master runs.")
 ]
 Insecure = Annotated[bool, typer.Option("--insecure", help="Allow addresses other than loopback.")]
+MetricsPort = Annotated[
+    int | None, typer.Option(min=0, max=65535, help="Serve metrics for Prometheus there.")
+]
+MetricsHost = Annotated[str, typer.Option(help="Address for that; nobody is asked who he is.")]
+LogStyle = Annotated[LogFormat, typer.Option(help="Of messages on standard error.")]
 ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
 
 
@@ -131,11 +142,18 @@ def run(  # noqa: PLR0917  options of the command line
     no_examine: Annotated[
         bool, typer.Option("--no-examine", help="Let the slaves take no trial steps first.")
     ] = False,
+    trace: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Trace of all requests, for Perfetto.")
+    ] = None,
+    metrics_port: MetricsPort = None,
+    metrics_host: MetricsHost = LOOPBACK,
+    log_format: LogStyle = LogFormat.TEXT,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
     stay_with_parent: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Run SYSTEM and write results, by default results.csv, steps, summary and a picture."""
+    configure_logs(log_format, _TEXT_FORMAT)
     with _interruptible(), ExitStack() as stack:
         if stay_with_parent:
             _end_with_parent()
@@ -181,14 +199,18 @@ def run(  # noqa: PLR0917  options of the command line
                 formats=tuple(output_format or ()),
             )
         )
+        observers: list[Observer] = [ProgressBar(quiet=quiet or log_format is LogFormat.JSON)]
+        if metrics_port is not None:
+            observers.append(_served_metrics(stack, metrics_port, metrics_host))
         try:
             run_system(
                 system,
                 output,
                 in_process=in_process,
                 launch=not no_launch,
-                observers=(ProgressBar(quiet=quiet),),
+                observers=observers,
                 uploading=stack.enter_context(UploadBar(quiet=quiet)),
+                trace=trace,
             )
         except KeyboardInterrupt:
             raise InterruptedRunError("interrupted before the first step") from None
@@ -447,6 +469,16 @@ def _credentials(directory: Path | None) -> Credentials | None:
     return None if directory is None else Credentials(directory.absolute(), Role.MASTER)
 
 
+def _served_metrics(stack: ExitStack, port: int, host: str) -> Observer:
+    """An observer whose numbers are served while ``stack`` lasts."""
+    from master_node.run_metrics import RunMetrics  # noqa: PLC0415  only when asked for
+    from protocol.metrics import metrics_served  # noqa: PLC0415
+
+    metrics = RunMetrics()
+    log.info("metrics at %s", stack.enter_context(metrics_served(port, host, metrics.read)))
+    return metrics
+
+
 def _order(text: str | None) -> int | str | None:
     """A number where it is one; whether it may be is for the system to say."""
     return int(text) if text is not None and text.isdecimal() else text
@@ -454,9 +486,18 @@ def _order(text: str | None) -> int | str | None:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the command with exit code 130, also where a shell ignores them."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+    """Ctrl-C and SIGTERM end the command with exit code 130, also where a shell ignores them.
+
+    A second one kills it: what it launched ends with it.
+    """
+
+    def interrupt(*_: object) -> NoReturn:
+        for number in _ENDING:
+            signal.signal(number, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    for number in _ENDING:
+        signal.signal(number, interrupt)
     try:
         yield
     except KeyboardInterrupt:
@@ -478,9 +519,12 @@ def _end_with_parent() -> None:
 
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s", stream=sys.stderr)
+    configure_logs(LogFormat.TEXT, _TEXT_FORMAT)
     try:
         app()
     except DoublestepError as error:
-        typer.echo(f"master-node: {error}", err=True)
+        if logs_json():
+            log.error("%s", error, extra=about(error))
+        else:
+            typer.echo(f"master-node: {error}", err=True)
         sys.exit(error.exit_code)

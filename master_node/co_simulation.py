@@ -179,6 +179,7 @@ class CoSimulation:
                 outputs.d,
                 output_control(self.coupled, self.system),
                 {part.name: part.description.state_kind for part in self.coupled.parts},
+                self.group.statistics,
             )
         )
         begin = perf_counter() - statistics.wall_time

@@ -75,6 +75,12 @@ def _labels(value: Mapping[str, str]) -> Mapping[str, str]:
     return value
 
 
+def _sha256(value: str) -> str:
+    if len(value) != 64 or set(value.lower()) - set("0123456789abcdef"):
+        raise ValueError("write 64 hexadecimal digits")
+    return value.lower()
+
+
 def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:
     if not value:
         raise ValueError("must not be empty")
@@ -322,6 +328,7 @@ class SlaveSettings(_Table):
     Attributes:
         model: an ``.fmu`` file, ``package.module:Class`` or ``file.py:Class``, relative to the
             system file; without it the slave is looked for on the bus, by name.
+        sha256: that the model's file must have, hexadecimal.
         host: name of the agent that starts the slave; None: any that has what is required.
         requires: labels of the agent that starts the slave; without both the master starts it.
         parameters: start values of parameters and other variables, by name.
@@ -340,6 +347,7 @@ class SlaveSettings(_Table):
     """
 
     model: StrictStr | None = None
+    sha256: Annotated[StrictStr, AfterValidator(_sha256)] | None = None
     host: Annotated[StrictStr, AfterValidator(_agent_name)] | None = None
     requires: Annotated[Mapping[StrictStr, StrictStr], AfterValidator(_labels)] = Field(
         default_factory=dict

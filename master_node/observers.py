@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal, NamedTuple, Protocol
 
+from protocol.calls import Call
 from protocol.signals import FloatArray
 
 DiscreteType = Literal["float", "integer", "boolean", "string", "binary"]
@@ -54,6 +55,7 @@ class RunStart:
         discrete_types: what they hold, d of them.
         discrete_units: their units, "" where none; empty when none has one.
         discrete: their values at T_0, d of them.
+        statistics: of each slave, by its name; they go on counting while the run goes on.
     """
 
     output_names: tuple[str, ...]
@@ -67,6 +69,7 @@ class RunStart:
     discrete: tuple[DiscreteValue, ...] = ()
     control: OutputControl = NOT_CONTROLLED
     state_kinds: Mapping[str, str] = field(default_factory=dict)
+    statistics: Mapping[str, SlaveStatistics] = field(default_factory=dict)
 
 
 class Point(NamedTuple):
@@ -125,15 +128,35 @@ class Outcome(StrEnum):
 
 @dataclass(slots=True)
 class SlaveStatistics:
-    """Counters of one slave over a run; times in seconds. ``restarts``: how often its process was
-    replaced.
+    """Counters of one slave over a run; times in seconds.
+
+    Attributes:
+        do_steps: steps that it took, or broke off.
+        rollbacks: how often it went back to a saved state.
+        requests: how many it has answered.
+        compute_time: that it spent on them, by its own monotonic clock.
+        request_time: from sending a request to having its reply. Replies are collected in the
+            order of the slaves, so it includes waiting for slower ones before.
+        restarts: how often its process was replaced.
     """
 
     do_steps: int = 0
     rollbacks: int = 0
     requests: int = 0
     compute_time: float = 0.0
+    request_time: float = 0.0
     restarts: int = 0
+
+    @property
+    def transport_time(self) -> float:
+        """What of the time of its requests it did not compute [s]: the way there and back."""
+        return max(0.0, self.request_time - self.compute_time)
+
+
+def slowest(statistics: Mapping[str, SlaveStatistics]) -> str:
+    """Name of the slave that has computed for the longest time; "" when none has."""
+    name = max(statistics, key=lambda name: statistics[name].compute_time, default="")
+    return name if name and statistics[name].compute_time > 0.0 else ""
 
 
 @dataclass(slots=True)
@@ -227,3 +250,36 @@ class Observers:
                 errors.append(error)
         if errors:
             raise errors[0]
+
+
+class Exchange(NamedTuple):
+    """One request to a slave and its reply.
+
+    Attributes:
+        slave: its name.
+        request: ``epoch:sequence``, as in the slave's log; "" without a bus.
+        program: what was asked.
+        sent, received: by the monotonic clock of the master (`time.perf_counter`) [s].
+        compute_time: that the slave spent on it [s]; NaN when there is no reply.
+        time: communication point t [s], or None.
+        step_size: communication step size H [s], or None.
+        error: of the slave or of the way to it, "" if none.
+    """
+
+    slave: str
+    request: str
+    program: Sequence[Call]
+    sent: float
+    received: float
+    compute_time: float
+    time: float | None
+    step_size: float | None
+    error: str = ""
+
+
+class ExchangeListener(Protocol):
+    """Gets told of every exchange of messages: traces. Without one, nothing is made for it."""
+
+    def exchanged(self, begin: float, end: float, exchanges: Sequence[Exchange]) -> None:
+        """Called after each round trip, from ``begin`` to ``end``, with what it consisted of."""
+        ...

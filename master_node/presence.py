@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from time import monotonic
 
 from master_node.launcher import Starter
 from master_node.remote_slave import RemoteSlave, slave_status
 from protocol.bus import Bus
+from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.errors import DoublestepError, ProtocolError, SlaveLostError
 from protocol.keys import SlaveKey, alive_slaves
 
@@ -27,11 +26,13 @@ class Presence:
 
     Args:
         bus: opened.
+        clock: for its waits.
     """
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, clock: Clock = SYSTEM_CLOCK) -> None:
         self._bus = bus
-        self._changed = threading.Condition()
+        self._clock = clock
+        self._changed = clock.condition()
         self._alive: set[SlaveKey] = set()
         self._remotes: Mapping[SlaveKey, RemoteSlave] = {}
         self._is_guarded = False
@@ -65,19 +66,25 @@ class Presence:
             ModelError, SlaveLostError: one that was started ended.
             ProtocolError: two slaves are found by one name.
         """
-        deadline = monotonic() + timeout
+        deadline = self._clock.monotonic() + timeout
         while True:
             for starter in starters:
                 starter.check()
             with self._changed:
                 alive = set(self._alive)
-                missing = [n for n in names if not any(_is_called(n, k) for k in alive)]
-                missing += [name for name, key in keys.items() if key not in alive]
-                if not missing:
-                    break
-                if monotonic() > deadline:
-                    raise self._not_found(missing, alive, timeout)
+            missing = [n for n in names if not any(_is_called(n, k) for k in alive)]
+            missing += [name for name, key in keys.items() if key not in alive]
+            found = {} if missing else self._only_instances(names)
+            missing = missing or [name for name in names if name not in found]
+            if not missing:
+                return found
+            if self._clock.monotonic() > deadline:
+                raise self._not_found(missing, alive, timeout)
+            with self._changed:
                 self._changed.wait(_POLL_TIME)
+
+    def _only_instances(self, names: Sequence[str]) -> dict[str, SlaveKey]:
+        """Asked for now: the one slave of each name; none of one that has just gone again."""
         found = {}
         for name in names:
             tokens = self._bus.alive(alive_slaves(name), _LIVELINESS_TIME)
@@ -90,9 +97,8 @@ class Presence:
                     slave=name,
                     remedy="end all but one of them",
                 )
-            if not instances:  # it went away just now
-                raise self._not_found([name], alive, timeout)
-            found[name] = instances[0]
+            if instances:
+                found[name] = instances[0]
         return found
 
     def wait_for(self, key: SlaveKey, starter: Starter, timeout: float) -> None:
@@ -102,13 +108,13 @@ class Presence:
             SlaveLostError: it did not appear within ``timeout`` seconds, or ended.
             ModelError: it ended because its model cannot be used.
         """
-        deadline = monotonic() + timeout
+        deadline = self._clock.monotonic() + timeout
         with self._changed:
             while key not in self._alive:
                 error = starter.ended(key.name)
                 if error is not None:
                     raise error
-                if monotonic() > deadline:
+                if self._clock.monotonic() > deadline:
                     raise self._not_found([key.name], set(self._alive), timeout)
                 self._changed.wait(_POLL_TIME)
 
@@ -163,13 +169,9 @@ class Presence:
             lost = [remote for remote in remotes if remote.key not in self._alive]
         for remote in lost:
             remote.lost()
-        guard = threading.Thread(
-            target=self._guard,
-            args=(why_ended, reconnect_time, can_restart),
-            name="presence",
-            daemon=True,
+        guard = self._clock.start(
+            lambda: self._guard(why_ended, reconnect_time, can_restart), "presence"
         )
-        guard.start()
         try:
             yield
         finally:
@@ -194,11 +196,13 @@ class Presence:
                 if not absent and not since:
                     self._changed.wait()
                     continue
-            now = monotonic()
+            now = self._clock.monotonic()
             names = {remote.key.name for remote in absent}
             if back := sorted(warned - names):
                 away = max(now - since[name] for name in back)
-                log.info("the connection to %s is back after %.1f s", ", ".join(back), away)
+                names_back = ", ".join(back)
+                about = {"slave": names_back}
+                log.info("the connection to %s is back after %.1f s", names_back, away, extra=about)
             since = {name: since.get(name, now) for name in names}
             warned &= names
             for remote in absent:
@@ -225,6 +229,7 @@ class Presence:
                     "the connection to %s was lost; waiting for it, %g s at most (reconnect_time)",
                     ", ".join(sorted(late)),
                     reconnect_time,
+                    extra={"slave": ", ".join(sorted(late))},
                 )
                 warned |= late
             with self._changed:

@@ -19,9 +19,9 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from master_node.agents import Sent
+from master_node.agent_models import Sent
 from master_node.numerics.extrapolation import InputPolynomial
-from master_node.observers import Attempt, RunEnd, RunStart
+from master_node.observers import Attempt, RunEnd, RunStart, SlaveStatistics, slowest
 
 UPDATE_INTERVAL = 0.1
 """Shortest time between two redraws [s]."""
@@ -47,11 +47,15 @@ class ProgressBar:
         self._rejected = 0
         self._time = 0.0
         self._next_update = 0.0
+        self._begin = 0.0
+        self._statistics: Mapping[str, SlaveStatistics] = {}
 
     def started(self, start: RunStart) -> None:
         """Show the empty bar, or the first line."""
         self._start_time = self._time = start.start_time
         self._rejected = 0
+        self._begin = monotonic()
+        self._statistics = start.statistics
         if self._quiet:
             return
         if not self._console.is_terminal:
@@ -83,7 +87,8 @@ class ProgressBar:
         self._draw(
             self._progress,
             f"t = {self._time:.4g} s  H = {attempt.step_size:.2e} s  k = {_polynomial(attempt)}"
-            f"  {self._rejected} rejected",
+            f"  {self._rejected} rejected"
+            f"{_slowest(self._statistics, monotonic() - self._begin, '  slowest: ')}",
         )
         self._next_update = monotonic() + UPDATE_INTERVAL
 
@@ -101,6 +106,7 @@ class ProgressBar:
         self._line(
             f"{end.outcome} at t = {statistics.time:g} s: {statistics.communication_steps} steps, "
             f"{statistics.rejected_double_steps} rejected, {statistics.wall_time:.3g} s"
+            f"{_slowest(statistics.slaves, statistics.wall_time, ', slowest: ')}"
         )
 
     def _draw(self, progress: Progress, state: str) -> None:
@@ -109,6 +115,14 @@ class ProgressBar:
 
     def _line(self, text: str) -> None:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _slowest(statistics: Mapping[str, SlaveStatistics], wall_time: float, label: str) -> str:
+    """The slave that computed for the longest time, with its part of ``wall_time`` [s]."""
+    name = slowest(statistics)
+    if not name or wall_time <= 0.0:
+        return ""
+    return f"{label}{name} {min(1.0, statistics[name].compute_time / wall_time):.0%}"
 
 
 class UploadBar:
@@ -188,6 +202,7 @@ _PER_SLAVE = (
     ("rollbacks", "rollbacks"),
     ("requests", "requests"),
     ("compute_time", "compute time [s]"),
+    ("transport_time", "transport [s]"),
 )
 
 

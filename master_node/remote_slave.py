@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import socket
-import threading
 from collections.abc import Sequence
-from time import monotonic, sleep
 
 from protocol.administration import Claim
 from protocol.bus import Bus, Caller, PendingReply
 from protocol.calls import Call, Reply
+from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.codec import (
     decode_map,
     decode_reply,
@@ -55,6 +54,7 @@ class RemoteSlave:
         step_timeout: bound on one request [s].
         reconnect_time: how long in all a request waits for a slave that is not on the bus [s].
             The slave is told to wait longer than that for its master.
+        clock: for its waits.
 
     Raises:
         SlaveBusyError: another run holds the slave.
@@ -62,13 +62,21 @@ class RemoteSlave:
     """
 
     def __init__(
-        self, bus: Bus, key: SlaveKey, run: str, step_timeout: float, reconnect_time: float
+        self,
+        bus: Bus,
+        key: SlaveKey,
+        *,
+        run: str,
+        step_timeout: float,
+        reconnect_time: float,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._bus = bus
         self._key = key
         self._step_timeout = step_timeout
         self._reconnect_time = reconnect_time
-        self._changed = threading.Condition()
+        self._clock = clock
+        self._changed = clock.condition()
         self._is_present = True
         self._loss: tuple[str, str] | None = None
         self._execute = self._caller()
@@ -105,6 +113,11 @@ class RemoteSlave:
         """True when its process was on this host and is no more; False: it may live."""
         return has_ended(self._host, self._pid)
 
+    @property
+    def request(self) -> str:
+        """See `SlaveLink`."""
+        return f"{self._epoch}:{self._sequence}"
+
     def start(self, calls: Sequence[Call]) -> None:
         """See `SlaveLink`."""
         self._sequence += 1
@@ -129,13 +142,13 @@ class RemoteSlave:
         """No reply means a connection that was lost, or one that is just coming back."""
         left = self._reconnect_time + _LOSS_MARGIN
         while True:
-            begin = monotonic()
+            begin = self._clock.monotonic()
             caller = self._caller_when_present(left)
-            left -= monotonic() - begin + _PAUSE
+            left -= self._clock.monotonic() - begin + _PAUSE
             try:
                 return caller.request(self._payload)
             except SlaveLostError:
-                sleep(_PAUSE)
+                self._clock.sleep(_PAUSE)
 
     def _caller_when_present(self, timeout: float) -> Caller:
         """Wait until the slave is on the bus; the old caller may have been cancelled."""

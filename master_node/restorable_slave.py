@@ -132,6 +132,11 @@ class RestorableSlave:
 
     # --- requests -------------------------------------------------------------------------------
 
+    @property
+    def request(self) -> str:
+        """See `SlaveLink`."""
+        return self._link.request
+
     def start(self, calls: Sequence[Call]) -> None:
         """See `SlaveLink`."""
         if self._broken is not None:

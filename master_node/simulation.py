@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from master_node.agents import Uploading
+from master_node.agent_models import Uploading
 from master_node.checkpoint_files import CheckpointStore
 from master_node.checkpoints import Checkpoints, ResultPosition, Resumed
 from master_node.co_simulation import CoSimulation, check_capabilities
@@ -19,6 +19,7 @@ from master_node.configuration import InputSettings, System
 from master_node.configure_slaves import configure
 from master_node.examinations import as_plain_data
 from master_node.input_loading import load_signals
+from master_node.model_hashes import check_hashes
 from master_node.observers import Observer, Observers
 from master_node.preparation import prepare
 from master_node.restorable_slave import RestorableSlave
@@ -32,9 +33,11 @@ from master_node.results import (
 )
 from master_node.resumption import RunMode, can_be_saved, check_models, reopened, saved_system
 from master_node.slave_group import SlaveGroup
+from master_node.slave_link import SlaveLink
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
 from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.system import resolve
+from master_node.trace import TraceWriter
 from protocol.slave import SlaveDescription
 
 log = logging.getLogger("master_node")
@@ -47,6 +50,7 @@ def simulate(
     in_process: bool = False,
     launch: bool = True,
     observers: Sequence[Observer] = (),
+    trace: Path | str | None = None,
     **simulation: Any,
 ) -> Result:
     """Run a system and give its result.
@@ -57,6 +61,7 @@ def simulate(
         in_process: run the slaves in this process, without a bus.
         launch: start slaves that have a model; False: find all of them on the bus.
         observers: are told of everything that happens.
+        trace: file for a trace of all requests, see ``docs/observability.md``; None: none.
         **simulation: settings that override ``system.simulation``, such as ``stop_time=4.0``.
 
     Raises:
@@ -72,6 +77,7 @@ def simulate(
         launch=launch,
         observers=observers,
         recording=recording,
+        trace=None if trace is None else Path(trace),
     )
     return recording.result()
 
@@ -85,6 +91,7 @@ def run(
     observers: Sequence[Observer] = (),
     recording: Recording | None = None,
     uploading: Uploading | None = None,
+    trace: Path | None = None,
 ) -> None:
     """Run a system; raises as `simulate`.
 
@@ -96,9 +103,10 @@ def run(
         observers: are told of everything that happens.
         recording: is told of the results that the system asks for, as the files are.
         uploading: told of models that are sent to agents.
+        trace: file for a trace of all requests; None: none.
     """
     mode = RunMode(in_process, launch)
-    _run(system, directory, mode, observers, recording=recording, uploading=uploading)
+    _run(system, directory, mode, observers, recording=recording, uploading=uploading, trace=trace)
 
 
 def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None:
@@ -148,17 +156,22 @@ def _run(
     recording: Recording | None = None,
     resumption: Resumption | None = None,
     uploading: Uploading | None = None,
+    trace: Path | None = None,
 ) -> None:
     settings = settings_of(system, {})
     check_step_sizes(system)
     signals = load_signals(system)
     if directory is not None:
         ResultsWriter(directory, settings).prepare()
-    with _slaves(system, directory, mode, uploading) as slaves:
+    with ExitStack() as stack:
+        traces = [] if trace is None else [stack.enter_context(closing(TraceWriter(trace)))]
+        slaves = stack.enter_context(_slaves(system, directory, mode, uploading))
         if resumption is not None:
             check_models(resumption.saved, slaves.descriptions)
+        check_hashes(system, slaves.descriptions)
         restorable = _restorable(slaves, system, directory)
-        links = {**slaves.links, **{slave.name: slave for slave in restorable}}
+        links: dict[str, SlaveLink] = dict(slaves.links)
+        links |= {slave.name: slave for slave in restorable}
         given = system
         descriptions = configure(links, system, slaves.descriptions)
         system = with_fixed_steps(system, descriptions)
@@ -166,7 +179,7 @@ def _run(
         warnings = check_capabilities(resolve(system, descriptions, signals), system)
         for warning in warnings:
             log.warning("%s", warning)
-        group = SlaveGroup(links)
+        group = SlaveGroup(links, traces)
         prepared = prepare(group, system, descriptions, signals)
         coupled = resolve(prepared.system, prepared.descriptions, signals)
         for warning in check_capabilities(coupled, prepared.system):
@@ -192,7 +205,7 @@ def _run(
             keepers.append(writer)
         selection = SelectionMemory() if resumed is None else resumed.files.selection
         selected = SelectedResults(Observers(keepers), wanted.variables, wanted.every, selection)
-        observer = Observers([*observers, selected])
+        observer = Observers([*observers, *traces, selected])
         checkpoints = Checkpoints(
             restorable,
             store,

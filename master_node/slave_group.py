@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 
-from master_node.observers import SlaveStatistics, Statistics
+from master_node.observers import Exchange, ExchangeListener, SlaveStatistics, Statistics
 from master_node.slave_link import SlaveLink
 from protocol.calls import Call, DoStep, Reply, SetState
 from protocol.errors import DoublestepError
@@ -17,6 +17,10 @@ Program = tuple[Call, ...]
 class SlaveGroup:
     """The slaves in a fixed order. One `execute` is one round trip, all slaves in parallel.
 
+    Args:
+        links: to the slaves.
+        listeners: are told of every exchange of messages.
+
     Attributes:
         names: of the slaves.
         round_trips: rounds so far.
@@ -24,7 +28,10 @@ class SlaveGroup:
         statistics: by slave.
     """
 
-    def __init__(self, links: Mapping[str, SlaveLink]) -> None:
+    def __init__(
+        self, links: Mapping[str, SlaveLink], listeners: Sequence[ExchangeListener] = ()
+    ) -> None:
+        self._listeners = tuple(listeners)
         self.names = tuple(links)
         self._links = tuple(links.values())
         self._indices = range(len(self.names))
@@ -67,10 +74,10 @@ class SlaveGroup:
         Raises:
             DoublestepError: a slave could not be reached; all others were waited for.
         """
-        begin = perf_counter()
+        begin = now = perf_counter()
         failure: DoublestepError | None = None
         replies = []
-        pending: list[tuple[int, Program]] = []
+        pending: list[tuple[int, Program, float, float]] = []
         indices = self._indices if slaves is None else slaves
         for index, program in zip(indices, programs, strict=True):
             try:
@@ -78,25 +85,58 @@ class SlaveGroup:
             except DoublestepError as error:
                 failure = failure or self._located(error, index, program)
                 break
-            pending.append((index, program))
-        for index, program in pending:
+            before, now = now, perf_counter()
+            pending.append((index, program, before, now))
+        all_sent = now
+        exchanges: list[Exchange] = []
+        for index, program, begun, sent in pending:
+            reply: Reply | None = None
             try:
                 reply = self._links[index].finish()
             except DoublestepError as error:
                 failure = failure or self._located(error, index, program)
-                continue
-            replies.append(reply)
-            statistics = self._statistics[index]
-            statistics.requests += 1
-            statistics.compute_time += reply.compute_time
-            if reply.error is not None:
-                self._located(reply.error, index, program)
-                reply.error.located(time=time, step_size=step_size)
-        self.wait_time += perf_counter() - begin
+            now = perf_counter()
+            if reply is not None:
+                replies.append(reply)
+                statistics = self._statistics[index]
+                statistics.requests += 1
+                statistics.compute_time += reply.compute_time
+                statistics.request_time += (sent - begun) + (now - all_sent)
+                if reply.error is not None:
+                    self._located(reply.error, index, program)
+                    reply.error.located(time=time, step_size=step_size)
+            if self._listeners:
+                exchanges.append(self._exchange(index, program, reply, begun, now, time, step_size))
+        self.wait_time += now - begin
         self.round_trips += 1
+        for listener in self._listeners:
+            listener.exchanged(begin, now, exchanges)
         if failure is not None:
             raise failure.located(time=time, step_size=step_size)
         return replies
+
+    def _exchange(  # noqa: PLR0917  once for each request
+        self,
+        index: int,
+        program: Program,
+        reply: Reply | None,
+        sent: float,
+        received: float,
+        time: float | None,
+        step_size: float | None,
+    ) -> Exchange:
+        error = "no reply" if reply is None else str(reply.error or "")
+        return Exchange(
+            self.names[index],
+            self._links[index].request,
+            program,
+            sent,
+            received,
+            float("nan") if reply is None else reply.compute_time,
+            time,
+            step_size,
+            error,
+        )
 
     def _located(self, error: DoublestepError, index: int, program: Program) -> DoublestepError:
         """Name the slave, and the call that a lost request was about: its step, if it has one."""

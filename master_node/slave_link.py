@@ -17,6 +17,11 @@ class SlaveLink(Protocol):
     reply.
     """
 
+    @property
+    def request(self) -> str:
+        """``epoch:sequence`` of the last program; "" without a bus."""
+        ...
+
     def start(self, calls: Sequence[Call]) -> None:
         """Send a program."""
         ...
@@ -32,6 +37,11 @@ class LocalSlave:
     def __init__(self, executor: CallExecutor) -> None:
         self._executor = executor
         self._reply = Reply([], None, 0.0)
+
+    @property
+    def request(self) -> str:
+        """See `SlaveLink`."""
+        return ""
 
     def start(self, calls: Sequence[Call]) -> None:
         """See `SlaveLink`; the program runs here and now."""

@@ -6,14 +6,16 @@ Each way is a context manager that gives a `Slaves` and leaves nothing running b
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from secrets import token_hex
 
-from master_node.agents import Agents, Uploading
+from master_node.agent_models import Uploading
+from master_node.agents import Agents
 from master_node.announcement import announce_run
 from master_node.configuration import System
 from master_node.launcher import Launcher, Starter
@@ -21,8 +23,9 @@ from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
 from master_node.restarts import Restarts
 from master_node.slave_link import LocalSlave, SlaveLink
-from protocol.bus import DEFAULT_ENDPOINT
+from protocol.bus import DEFAULT_ENDPOINT, Bus
 from protocol.calls import Describe
+from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.credentials import Credentials, Role
 from protocol.endpoints import Endpoints, Mode, free_endpoint
 from protocol.errors import (
@@ -33,6 +36,7 @@ from protocol.errors import (
     SlaveLostError,
 )
 from protocol.keys import SlaveKey
+from protocol.logs import add_log_fields
 from protocol.slave import SlaveDescription
 from protocol.slave_processes import connection_options
 from protocol.zenoh_bus import ZenohBus
@@ -131,6 +135,7 @@ def slaves_on_bus(
         bus = ZenohBus(endpoints, timeout=system.bus.discovery_timeout)
         stack.callback(bus.close)
         run = token_hex(4)
+        add_log_fields(run=run)
         announce_run(bus, run, system)
         launcher = stack.enter_context(
             Launcher(run, _connection(endpoints, private), log_directory, pin=system.bus.pin)
@@ -145,18 +150,6 @@ def slaves_on_bus(
         keys |= {name: agents.start(name) for name in system.slaves if name in elsewhere}
         presence = Presence(bus)
         keys |= presence.wait(found, keys, starters, system.bus.discovery_timeout)
-        remotes: dict[str, RemoteSlave] = {}
-        stack.callback(_release, remotes)
-
-        def claim(key: SlaveKey) -> RemoteSlave:
-            times = system.bus.step_timeout, system.bus.reconnect_time
-            try:
-                return RemoteSlave(bus, key, run, *times)
-            except DoublestepError as error:
-                raise error.located(slave=key.name, phase="claim") from None
-
-        for name in system.slaves:
-            remotes[name] = claim(keys[name])
 
         def why_ended(remote: RemoteSlave) -> str:
             died = "its process died" if remote.has_ended else ""
@@ -166,12 +159,21 @@ def slaves_on_bus(
             return next(filter(None, found), died)
 
         recovers = system.simulation.recovery == "auto"
-        stack.enter_context(
-            presence.guarded(
-                list(remotes.values()),
+        claim = partial(
+            claim_slave,
+            bus,
+            run=run,
+            step_timeout=system.bus.step_timeout,
+            reconnect_time=system.bus.reconnect_time,
+        )
+        remotes = stack.enter_context(
+            claimed_slaves(
+                claim,
+                presence,
+                {name: keys[name] for name in system.slaves},
                 why_ended,
-                system.bus.reconnect_time,
-                lambda name: recovers and name in started,
+                reconnect_time=system.bus.reconnect_time,
+                can_restart=lambda name: recovers and name in started,
             )
         )
 
@@ -182,7 +184,7 @@ def slaves_on_bus(
             return launcher.launch(name, model, system.base), launcher
 
         restarts = Restarts(system, remotes, claim, start_again, presence, frozenset(started))
-        slaves = Slaves(dict(remotes), _describe(remotes), starters, restarts if recovers else None)
+        slaves = Slaves(dict(remotes), describe(remotes), starters, restarts if recovers else None)
         agents.verify(slaves.descriptions)
         try:
             yield slaves
@@ -195,19 +197,90 @@ def slaves_on_bus(
             raise slaves.explain(error) from error.__cause__
 
 
+def claim_slave(
+    bus: Bus,
+    key: SlaveKey,
+    *,
+    run: str,
+    step_timeout: float,
+    reconnect_time: float,
+    clock: Clock = SYSTEM_CLOCK,
+) -> RemoteSlave:
+    """Claim a slave for a run.
+
+    Args:
+        bus: on which it is.
+        key: its address.
+        run: id of the run.
+        step_timeout: bound on one request [s].
+        reconnect_time: how long to wait for one that vanished [s].
+        clock: for all waits.
+
+    Raises:
+        SlaveBusyError, SlaveLostError, DeadlineError: it cannot be claimed; names it.
+    """
+    try:
+        return RemoteSlave(
+            bus,
+            key,
+            run=run,
+            step_timeout=step_timeout,
+            reconnect_time=reconnect_time,
+            clock=clock,
+        )
+    except DoublestepError as error:
+        raise error.located(slave=key.name, phase="claim") from None
+
+
+@contextmanager
+def claimed_slaves(
+    claim: Callable[[SlaveKey], RemoteSlave],
+    presence: Presence,
+    keys: Mapping[str, SlaveKey],
+    why_ended: Callable[[RemoteSlave], str],
+    *,
+    reconnect_time: float,
+    can_restart: Callable[[str], bool] = lambda _: False,
+) -> Iterator[dict[str, RemoteSlave]]:
+    """Claim slaves for a run, look after them, and give them back at the end.
+
+    Args:
+        claim: claims one, see `claim_slave`, whose errors it raises.
+        presence: follows their tokens.
+        keys: their addresses by name, in the order in which they are claimed.
+        why_ended: why a slave's process is no more; "": it may live.
+        reconnect_time: how long to wait for one that vanished [s].
+        can_restart: whether the slave of a name can be started again; one that was is put in the
+            place of the old one.
+    """
+    with ExitStack() as stack:
+        remotes: dict[str, RemoteSlave] = {}
+        stack.callback(_release, remotes)
+        for name, key in keys.items():
+            remotes[name] = claim(key)
+        stack.enter_context(
+            presence.guarded(list(remotes.values()), why_ended, reconnect_time, can_restart)
+        )
+        yield remotes
+
+
 def _release(remotes: Mapping[str, RemoteSlave]) -> None:
     for remote in reversed(list(remotes.values())):
         remote.release()
 
 
-def _describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
+def describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
+    """What each slave says of itself; raises what it answers instead, with its name."""
     for link in links.values():
         link.start([Describe()])
     descriptions = {}
     for name, link in links.items():
-        reply = link.finish()
-        if reply.error is not None:
-            raise reply.error.located(slave=name)
+        try:
+            reply = link.finish()
+            if reply.error is not None:
+                raise reply.error
+        except DoublestepError as error:
+            raise error.located(slave=name, phase=Describe.verb) from error.__cause__
         description = reply.results[0]
         assert isinstance(description, SlaveDescription)
         descriptions[name] = description

@@ -131,7 +131,7 @@ class InProcessBus(Bus):
 
     def alive(self, pattern: str, timeout: float) -> list[str]:  # noqa: ARG002  known at once
         """See `Bus`."""
-        return sorted(key for key in self._tokens if _matches(pattern, key))
+        return sorted(key for key in self._tokens if matches(pattern, key))
 
     def watch(self, pattern: str, listener: AliveListener) -> None:
         """See `Bus`."""
@@ -149,7 +149,7 @@ class InProcessBus(Bus):
 
     def _tell(self, key: str, alive: bool) -> None:
         for pattern, listener in self._listeners:
-            if _matches(pattern, key):
+            if matches(pattern, key):
                 listener(key, alive)
 
     def handle(self, key: str, payload: bytes) -> bytes:
@@ -187,7 +187,8 @@ class _Done(PendingReply):
         return self._outcome
 
 
-def _matches(pattern: str, key: str) -> bool:
+def matches(pattern: str, key: str) -> bool:
+    """Whether ``key`` is one of those that ``pattern`` stands for; ``*`` is any one part."""
     chunks, parts = pattern.split("/"), key.split("/")
     return len(chunks) == len(parts) and all(
         chunk in ("*", part) for chunk, part in zip(chunks, parts, strict=True)

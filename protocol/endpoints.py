@@ -10,6 +10,9 @@ from enum import StrEnum
 from protocol.credentials import Credentials
 from protocol.errors import ConfigurationError
 
+LOOPBACK = "127.0.0.1"
+"""Reached from this host only."""
+
 
 class Mode(StrEnum):
     """How a participant takes part in the bus.

@@ -18,16 +18,20 @@ from dataclasses import asdict
 from pathlib import Path
 from secrets import token_hex
 from types import FrameType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from protocol.bus import DEFAULT_ENDPOINT
 from protocol.credentials import Credentials, Role
-from protocol.endpoints import Endpoints, Mode
+from protocol.endpoints import LOOPBACK, Endpoints, Mode
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
+from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.slave import StartValue
+
+if TYPE_CHECKING:
+    from slave_node.worker import Worker
 
 app = typer.Typer(
     help="Serve an FMU or a Python model as a co-simulation slave.",
@@ -73,6 +77,13 @@ def serve(  # noqa: PLR0917  options of the command line
     mode: Annotated[
         Mode, typer.Option(help="peer: reach masters directly; client: through a router.")
     ] = Mode.PEER,
+    metrics_port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Serve metrics for Prometheus there.")
+    ] = None,
+    metrics_host: Annotated[
+        str, typer.Option(help="Address for that; nobody is asked who he is.")
+    ] = LOOPBACK,
+    log_format: Annotated[LogFormat, typer.Option(help="Of messages.")] = LogFormat.TEXT,
     fmi_logging: Annotated[
         bool, typer.Option("--fmi-logging", help="Let the FMU log all categories.")
     ] = False,
@@ -96,9 +107,7 @@ def serve(  # noqa: PLR0917  options of the command line
     from slave_node.worker import ModelReference, WorkerProcess  # noqa: PLC0415
 
     key = SlaveKey(check_name(name or _default_name(model)), instance or token_hex(4))
-    logging.basicConfig(
-        level=logging.INFO, stream=sys.stderr, format=f"%(asctime)s {key.name}: %(message)s"
-    )
+    configure_logs(log_format, f"%(asctime)s {key.name}: %(message)s", slave=key.name)
     endpoints = Endpoints(
         listen=tuple(listen or ()),
         connect=tuple(connect or (() if listen else (DEFAULT_ENDPOINT,))),
@@ -107,11 +116,20 @@ def serve(  # noqa: PLR0917  options of the command line
         credentials=None if tls is None else Credentials(tls.absolute(), Role.SLAVE),
     )
     reference = ModelReference(
-        model, base.absolute(), key.name, _parameters(parameter or []), fmi_logging, state
+        model,
+        base.absolute(),
+        key.name,
+        _parameters(parameter or []),
+        fmi_logging,
+        state,
+        log_format,
     )
     if processor is not None:
         os.sched_setaffinity(0, {processor})  # type: ignore[attr-defined,unused-ignore]  # Linux
-    worker = WorkerProcess(reference)
+    stack = ExitStack()
+    worker: Worker = WorkerProcess(reference)
+    if metrics_port is not None:
+        worker = _counting(worker, key.name, stack, metrics_port, metrics_host)
     bus: ZenohBus | None = None
     node: SlaveNode | None = None
     ending = threading.Event()
@@ -147,6 +165,7 @@ def serve(  # noqa: PLR0917  options of the command line
         if bus is not None:
             bus.close()
         worker.stop()
+        stack.close()
     log.info("ended")
 
 
@@ -193,10 +212,11 @@ def router(
 
 
 @app.command()
-def check(
+def check(  # noqa: PLR0917  options of the command line
     name: Annotated[str, typer.Argument(help="Slave to look for [default: a router].")] = "",
+    agent: Annotated[bool, typer.Option("--agent", help="NAME is an agent.")] = False,
     connect: Annotated[
-        str, typer.Option(help="Router, or the slave itself where it listens.")
+        str, typer.Option(help="Router, or the slave or agent itself where it listens.")
     ] = DEFAULT_ENDPOINT,
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
@@ -219,7 +239,7 @@ def check(
         check_name(name)
     bus = ZenohBus(endpoints, timeout=timeout)
     try:
-        check_alive(bus, name)
+        check_alive(bus, name, agent=agent)
     finally:
         bus.close()
 
@@ -404,6 +424,16 @@ def validate(
         raise unusable(model)
 
 
+def _counting(worker: Worker, name: str, stack: ExitStack, port: int, host: str) -> Worker:
+    """The same worker, counted; its numbers are served while ``stack`` lasts."""
+    from protocol.metrics import metrics_served  # noqa: PLC0415  only when asked for
+    from slave_node.metrics import CountingWorker  # noqa: PLC0415
+
+    counting = CountingWorker(worker, name)
+    log.info("metrics at %s", stack.enter_context(metrics_served(port, host, counting.read)))
+    return counting
+
+
 def _where(endpoints: Endpoints) -> str:
     places = [f"at {e}" for e in endpoints.listen] + [f"to {e}" for e in endpoints.connect]
     return ", ".join(places)
@@ -475,5 +505,8 @@ def main() -> None:
     try:
         app()
     except DoublestepError as error:
-        typer.echo(f"slave-node: {error}", err=True)
+        if logs_json():
+            log.error("%s", error, extra=about(error))
+        else:
+            typer.echo(f"slave-node: {error}", err=True)
         sys.exit(error.exit_code)

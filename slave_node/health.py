@@ -1,31 +1,33 @@
-"""Whether a slave or a router is there, told by its liveliness token: for service managers."""
+"""Whether a slave, agent or router is there, told by its liveliness token: for service managers."""
 
 from __future__ import annotations
 
 from protocol.bus import Bus
 from protocol.errors import SlaveLostError
-from protocol.keys import alive_routers, alive_slaves
+from protocol.keys import alive_agents, alive_routers, alive_slaves
 
 _TOKEN_TIME = 1.0
 
 
-def check_alive(bus: Bus, name: str) -> None:
+def check_alive(bus: Bus, name: str, *, agent: bool = False) -> None:
     """Look for the token of the slave called ``name``, or of any router where it is empty.
 
     Args:
-        bus: connected to the router, or to the slave itself.
-        name: of the slave, or "".
+        bus: connected to the router, or to the slave or agent itself.
+        name: of the slave or agent, or "".
+        agent: look for an agent.
 
     Raises:
         SlaveLostError: nobody has put it up: who it is of has not begun to serve, or is gone.
     """
-    if bus.alive(alive_slaves(name) if name else alive_routers(), _TOKEN_TIME):
+    alive_named, kind = (alive_agents, "agent") if agent else (alive_slaves, "slave")
+    if bus.alive(alive_named(name) if name else alive_routers(), _TOKEN_TIME):
         return
-    there = sorted({key.split("/")[2] for key in bus.alive(alive_slaves(), _TOKEN_TIME)})
+    there = sorted({key.split("/")[2] for key in bus.alive(alive_named("*"), _TOKEN_TIME)})
     if not name:
         raise SlaveLostError("no router is on the bus", phase="check")
     raise SlaveLostError(
-        f"is not on the bus; found there: {', '.join(there) or 'no slave at all'}",
+        f"is not on the bus; found there: {', '.join(there) or f'no {kind} at all'}",
         slave=name,
         phase="check",
     )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import threading
 import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
@@ -17,6 +16,7 @@ from datetime import datetime
 from protocol.administration import DEFAULT_ORPHAN_TIME, Claim, SlaveStatus
 from protocol.bus import Bus
 from protocol.calls import CALLS, Call, Reply, Reset
+from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.codec import (
     PROTOCOL_VERSION,
     decode_map,
@@ -68,6 +68,7 @@ class SlaveNode:
         description: of the slave that ``worker`` holds.
         orphan_time: a slave whose master vanished without release resets itself after this [s],
             unless the master's claim says after how long.
+        clock: for its waits and locks.
     """
 
     def __init__(
@@ -77,6 +78,8 @@ class SlaveNode:
         key: SlaveKey,
         description: SlaveDescription,
         orphan_time: float = DEFAULT_ORPHAN_TIME,
+        *,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._bus = bus
         self._worker = worker
@@ -85,7 +88,8 @@ class SlaveNode:
         self._orphan_time = orphan_time
         self._claims = Claims()
         self._changes_of_master = 0
-        self._running = threading.Lock()
+        self._clock = clock
+        self._running = clock.lock()
         self._worker_alive = True
         self._since = time.time()
 
@@ -133,18 +137,20 @@ class SlaveNode:
                 again = self._claims.admit(epoch, sequence)
                 if again is not None:
                     return again
-                reply = self._run(program)
+                reply = self._run(program, epoch, sequence)
                 self._claims.record(sequence, reply)
             except DoublestepError as error:
                 return encode_error(error)
             return reply
 
-    def _run(self, program: bytes) -> bytes:
+    def _run(self, program: bytes, epoch: int = 0, sequence: int = 0) -> bytes:
+        """Execute a program, that of a request or, without a number, one of the node's own."""
         try:
             return self._worker.execute(program)
         except SlaveCrashedError as error:
             if self._worker_alive:
-                log.error("%s", error)
+                request = f"{epoch}:{sequence}" if sequence else ""
+                log.error("%s", error, extra={"request": request, **_about(self._claims.holder)})
             self._worker_alive = False
             return encode_error(error)
 
@@ -193,7 +199,7 @@ class SlaveNode:
                     self._renew()
                 epoch = self._claims.claim(holder)
             if new:
-                log.info("claimed by %s", holder)
+                log.info("claimed by %s", holder, extra=_about(holder))
                 self._look_after(epoch, holder.orphan_time)  # a claim may arrive after its run
         except DoublestepError as error:
             log.warning("claim refused: %s", error)
@@ -210,7 +216,7 @@ class SlaveNode:
             with self._running:
                 holder = self._claims.holder
                 self._claims.release(epoch)
-                log.info("released by %s", holder)
+                log.info("released by %s", holder, extra=_about(holder))
                 self._reset()
         except DoublestepError as error:
             return encode_error_map(error.located(slave=self._key.name, phase=RELEASE))
@@ -263,17 +269,16 @@ class SlaveNode:
             return
         self._changes_of_master += 1
         if alive:
-            log.info("the master is there: %s", holder)
+            log.info("the master is there: %s", holder, extra=_about(holder))
             return
-        log.warning("the master is gone: %s", holder)
+        log.warning("the master is gone: %s", holder, extra=_about(holder))
         ended = has_ended(holder.host, holder.pid)
         self._look_after(self._claims.epoch, 0.0 if ended else holder.orphan_time)
 
     def _look_after(self, epoch: int, wait: float) -> None:
         """See after ``wait`` seconds whether the master of ``epoch`` is there."""
-        timer = threading.Timer(wait, self._reset_orphan, (epoch, self._changes_of_master))
-        timer.daemon = True
-        timer.start()
+        changes = self._changes_of_master
+        self._clock.later(wait, lambda: self._reset_orphan(epoch, changes))
 
     def _reset_orphan(self, epoch: int, changes: int) -> None:
         """Give a slave back whose master is gone; a step under way is for nobody any more."""
@@ -288,7 +293,7 @@ class SlaveNode:
                 self._end_worker("its master is gone")
             with self._running:
                 self._claims.release(epoch)
-                log.warning("reset; free for another master")
+                log.warning("reset; free for another master", extra=_about(holder))
                 self._reset()
         except (SequenceError, SlaveLostError) as error:
             log.info("not reset: %s", error)  # released meanwhile, or the node is ending
@@ -304,6 +309,11 @@ def _capabilities(description: SlaveDescription) -> str:
         "output derivatives": can.max_output_derivative_order > 0,
     }
     return ", ".join(name for name, has in known.items() if has)
+
+
+def _about(holder: Holder | None) -> dict[str, str]:
+    """Whose run a message of the log is about."""
+    return {} if holder is None else {"run": holder.run}
 
 
 def _epoch(message: Mapping[str, StartValue]) -> int:

@@ -31,6 +31,7 @@ from protocol.errors import (
     SlaveCrashedError,
     SlaveKilledError,
 )
+from protocol.logs import LogFormat, configure_logs
 from protocol.slave import CallExecutor, SlaveDescription, StartValue
 
 _END = b""
@@ -47,7 +48,8 @@ _FROM_OUTSIDE = frozenset(
 @dataclass(frozen=True, slots=True)
 class ModelReference:
     """What to load: see `slave_node.loading.load_executor`; ``parameters`` are start values that
-    hold unless the master gives others, ``state_kind`` unless it asks for another.
+    hold unless the master gives others, ``state_kind`` unless it asks for another; ``log_format``
+    is that of the worker's messages.
     """
 
     model: str
@@ -56,6 +58,7 @@ class ModelReference:
     parameters: Mapping[str, StartValue] = field(default_factory=dict)
     log_all: bool = False
     state_kind: str = ""
+    log_format: LogFormat = LogFormat.TEXT
 
 
 class Worker(Protocol):
@@ -223,6 +226,9 @@ def _main(pipe: Connection, reference: ModelReference, scratch: str) -> None:
     _die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    configure_logs(
+        reference.log_format, f"%(asctime)s {reference.name}: %(message)s", slave=reference.name
+    )
     try:
         from slave_node.loading import load_executor  # noqa: PLC0415  after the process is set up
 

@@ -24,7 +24,8 @@ import psutil
 import pytest
 
 from master_node import Result, System, load_system, simulate
-from master_node.agents import Agents, Sent
+from master_node.agent_models import Sent
+from master_node.agents import Agents
 from master_node.simulation import run as run_system
 from protocol.agents import (
     CHUNK_BYTES,

@@ -484,6 +484,8 @@ def test_values_that_contradict_each_other(tmp_path: Path, lines: str, words: st
         ('[slaves."a/b"]', "'a/b' is not a valid slave name; use 1 to 128 characters out of"),
         ('[slaves."a*"]', "'a*' is not a valid slave name"),
         ('[slaves.""]', "'' is not a valid slave name"),
+        ('[slaves.a]\nsha256 = "12"', "write 64 hexadecimal digits"),
+        ('[slaves.a]\nsha256 = "' + 64 * "g" + '"', "write 64 hexadecimal digits"),
         ('simulation = "x"\n[slaves.a]', "simulation = 'x': must be a table"),
         ("[slaves.a]\nmodel = 3", "[slaves.a] model = 3: "),
         (

@@ -35,7 +35,9 @@ APPS = {"master-node": master_node.cli.app, "slave-node": slave_node.cli.app}
 MANIFESTS = sorted((ROOT / "deploy" / "kubernetes").glob("*.yaml"))
 UNITS = sorted((ROOT / "deploy" / "systemd").glob("*.service"))
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text(encoding="utf-8"))
-SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+ALL_SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+SERVICES = {name: s for name, s in ALL_SERVICES.items() if "profiles" not in s}
+"""Those that ``up`` starts."""
 
 
 def documents() -> list[dict[str, Any]]:
@@ -79,10 +81,10 @@ def test_the_compose_file_is_valid(tmp_path: Path) -> None:
     assert schema_errors(broken).returncode != 0
 
 
-@pytest.mark.parametrize("name", SERVICES)
+@pytest.mark.parametrize("name", ALL_SERVICES)
 def test_the_commands_of_a_service_can_be_given(name: str) -> None:
     """Options exist, hosts are services, slaves are called as their service, models are built."""
-    service = SERVICES[name]
+    service = ALL_SERVICES[name]
     check_command(service["command"])
     known = {*SERVICES, "127.0.0.1", "0.0.0.0"}
     assert set(endpoints(service["command"])) <= known
@@ -106,10 +108,10 @@ def test_the_services_are_those_of_the_system() -> None:
     assert waits == {name: {"condition": "service_healthy"} for name in system.slaves}
 
 
-@pytest.mark.parametrize("name", SERVICES)
+@pytest.mark.parametrize("name", ALL_SERVICES)
 def test_a_service_can_do_no_more_than_it_must(name: str) -> None:
     """No root, no capabilities, nothing to write to but memory and results, bounded in size."""
-    service = SERVICES[name]
+    service = ALL_SERVICES[name]
     user = re.sub(r"\$\{\w+:-(\d+)\}", r"\1", service["user"])
     assert all(int(number) > 0 for number in user.split(":"))
     assert service["read_only"] is True
@@ -276,6 +278,26 @@ def test_the_commands_of_the_containers_simulate_the_quarter_car(
     system = load_system(tmp_path / "models" / "displacement.toml")
     known = simulate(system, in_process=True)
     assert result.summary["outcome"] == "completed"
+    assert result.time.tobytes() == known.time.tobytes()
+    assert result.outputs.tobytes() == known.outputs.tobytes()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="uses signals")
+@pytest.mark.usefixtures("no_process_left")
+def test_the_agent_of_the_compose_file_starts_slaves(processes: Processes, tmp_path: Path) -> None:
+    """Router and agent, and a master that names the agent: the results of a plain run."""
+    for name in ("router", "agent"):
+        processes.start(ALL_SERVICES[name]["command"])
+        processes.wait_healthy(ALL_SERVICES[name]["healthcheck"]["test"][1:])
+    file = tmp_path / "models" / "displacement.toml"
+    known = simulate(load_system(file), in_process=True)
+    for model in ("chassis.fmu", "wheel.fmu"):
+        text = file.read_text(encoding="utf-8")
+        file.write_text(text.replace(f'"{model}"', f'"{model}"\nhost = "agent"'), encoding="utf-8")
+    command = [word for word in SERVICES["master"]["command"] if word != "--no-launch"]
+    assert processes.run(command) == 0
+    result = Result.load(tmp_path / "results")
+    assert result.summary["settings"]["slaves"]["wheel"]["host"] == "agent"
     assert result.time.tobytes() == known.time.tobytes()
     assert result.outputs.tobytes() == known.outputs.tobytes()
 

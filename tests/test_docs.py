@@ -28,7 +28,7 @@ from typer.testing import CliRunner
 
 import master_node.cli
 import slave_node.cli
-from master_node import simulate
+from master_node import remote_slave, simulate
 from master_node.configuration import (
     BusSettings,
     Connection,
@@ -42,6 +42,7 @@ from master_node.configuration import (
 )
 from master_node.numerics.error_estimators import EST_MOD, EST_RICH
 from master_node.numerics.reductions import REDUCTIONS
+from master_node.run_metrics import RunMetrics
 from master_node.study.configuration import (
     Cases,
     Resources,
@@ -57,7 +58,9 @@ from protocol import codec, errors
 from protocol.calls import CALLS
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState
 from protocol.signals import MAX_ORDER
+from slave_node.metrics import CountingWorker
 from slave_node.snapshots import LIMIT
+from tests.light_slaves import LightWorker
 
 ROOT = Path(__file__).parents[1]
 BOUND = 30.0
@@ -148,7 +151,7 @@ def test_a_command_line_in_a_document_can_be_given(document: str, words: list[st
 def check_python(arguments: list[str]) -> list[str]:
     """Check a call of Python; gives the files that it names."""
     match arguments:
-        case ["-m", "benchmarks", name]:
+        case ["-m", "benchmarks", name, *_]:
             assert (ROOT / "benchmarks" / f"{name}.py").is_file()
             return []
         case ["-m", "benchmarks.reproduction", *parts]:
@@ -561,6 +564,47 @@ def test_the_messages_to_look_up_are_those_of_the_program() -> None:
 def joined(texts: list[str]) -> list[str]:
     """Cause and remedy as they are shown: one after the other."""
     return [f"{a}; {b}" for a, b in pairwise(texts)]
+
+
+# --- reliability --------------------------------------------------------------------------------
+
+
+def test_every_row_of_the_fault_matrix_names_tests_that_exist() -> None:
+    """No fault without a proof, and no proof that is not there."""
+    (table,) = tables(section(read("docs/reliability.md"), "## The fault matrix"))
+    assert len(table) > 25
+    for fault, _, proofs in table[1:]:
+        named = re.findall(r"`(tests/test_\w+\.py)::(\w+)`", proofs)
+        assert named, f"no test for: {fault}"
+        assert proofs.count("`") == 2 * len(named), f"not a test: {proofs}"
+        for file, test in named:
+            tree = ast.parse(read(file))
+            tests = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+            assert test in tests, f"{file} has no {test}"
+
+
+def test_the_bounds_of_waits_are_those_of_the_program() -> None:
+    """The table of waits, as far as they are no keys of the system file."""
+    rows = dict(tables(section(read("docs/reliability.md"), WAITS))[0][1:])
+    assert f"{remote_slave._CLAIM_TIME:g} s" in rows["for a claim"]
+    assert f"{remote_slave._GOODBYE_TIME:g} s" in rows["for a slave to be given back at the end"]
+    margin = rows["a slave for its master that vanished"]
+    assert f"{remote_slave._ORPHAN_MARGIN:g} s more" in margin
+    assert f"{BusSettings().step_timeout:g} s" in rows["for a reply to a request"]
+
+
+WAITS = "## What is waited for, and how long"
+
+
+def test_the_metrics_are_those_of_the_program() -> None:
+    """Every metric of a run and of a slave is in the document, no other."""
+    of_run, of_slave = tables(section(read("docs/observability.md"), "## Metrics"))
+    for table, metrics in (
+        (of_run, RunMetrics().read()),
+        (of_slave, CountingWorker(LightWorker("left"), "left").read()),
+    ):
+        names = {f"doublestep_{m.name}{'_total' * (m.kind == 'counter')}" for m in metrics}
+        assert set(re.findall(r"`(\w+)`", " ".join(row[0] for row in table[1:]))) == names
 
 
 # --- links --------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from master_node import progress as progress_module
-from master_node.agents import Sent
+from master_node.agent_models import Sent
 from master_node.observers import Attempt, Outcome, RunEnd, RunStart, SlaveStatistics, Statistics
 from master_node.progress import ProgressBar, UploadBar, summary_table
 from master_node.results import summarize
@@ -29,7 +29,7 @@ END = RunEnd(
         time=5.0,
         smallest_step_size=0.5,
         largest_step_size=1.0,
-        slaves={"s[1]": SlaveStatistics(10, 2, 6, 0.75)},
+        slaves={"s[1]": SlaveStatistics(10, 2, 6, 0.75, 1.0)},
     ),
 )
 
@@ -51,7 +51,7 @@ def test_without_a_terminal_two_plain_lines() -> None:
     drive(ProgressBar(console=Console(file=out)), attempts=1000)
     assert out.getvalue().splitlines() == [
         "simulating from 1 to 5 s",
-        "completed at t = 5 s: 6 steps, 1 rejected, 1.5 s",
+        "completed at t = 5 s: 6 steps, 1 rejected, 1.5 s, slowest: s[1] 50%",
     ]
 
 
@@ -136,7 +136,7 @@ def test_summary_table_has_run_and_slaves() -> None:
     assert ["simulated", "time", "4", "s"] in lines
     assert ["estimator", "richardson"] in lines
     assert ["rejected", "double", "steps", "1"] in lines
-    assert ["s[1]", "10", "2", "6", "0.75"] in lines
+    assert ["s[1]", "10", "2", "6", "0.75", "0.25"] in lines
 
 
 def test_summary_table_leaves_out_what_is_not_known() -> None:

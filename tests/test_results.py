@@ -63,8 +63,8 @@ def rejected(time: float, step_size: float, error_norm: float = 7.5) -> Attempt:
 def end(time: float = 1.0, outcome: Outcome = Outcome.COMPLETED, message: str = "") -> RunEnd:
     """The end of a run, with a different number in each counter."""
     slaves = {
-        "wheel": SlaveStatistics(9, 1, 5, 0.25),
-        "chassis": SlaveStatistics(9, 2, 6, 0.125),
+        "wheel": SlaveStatistics(9, 1, 5, 0.25, 0.75),
+        "chassis": SlaveStatistics(9, 2, 6, 0.125, 0.125),
     }
     return RunEnd(
         outcome,
@@ -237,6 +237,7 @@ def test_summary_says_what_happened(tmp_path: Path) -> None:
         "rollbacks": {"wheel": 1, "chassis": 2},
         "requests": {"wheel": 5, "chassis": 6},
         "compute_time": {"wheel": 0.25, "chassis": 0.125},
+        "transport_time": {"wheel": 0.5, "chassis": 0.0},
         "round_trips": 10,
         "wall_time": 2.0,
         "wait_time": 0.5,

@@ -300,6 +300,9 @@ def lags() -> Iterator[Fmu]:
         ("internal_clock", "A lag that moves every 10 ms", held),
         ("euler_per_step", "A lag, one explicit Euler step per communication step", held),
         ("licence_error", "A lag that needs a licence", whole),
+        ("crashes", "A lag that crashes beyond 0.25 s", whole),
+        ("hangs", "A lag with a step without an end beyond 0.25 s", whole),
+        ("not_finite", "A lag whose output is infinite beyond 0.25 s", whole),
     ):
         yield make_fmu(
             lag_description(name, description),

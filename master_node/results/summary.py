@@ -18,9 +18,9 @@ from master_node.results.files import cannot_read, cannot_write, malformed, repl
 def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> dict[str, Any]:
     """The summary of a run as plain data for JSON; a number that is not finite is None.
 
-    ``state_kind``, ``do_steps``, ``rollbacks``, ``restarts``, ``requests`` and ``compute_time`` [s]
-    are maps by slave, ``controlled_by`` by the kind of control, ``units`` and ``discrete_types`` by
-    variable.
+    ``state_kind``, ``do_steps``, ``rollbacks``, ``restarts``, ``requests``, ``compute_time`` [s]
+    and ``transport_time`` [s] are maps by slave, ``controlled_by`` by the kind of control,
+    ``units`` and ``discrete_types`` by variable.
     """
     statistics = end.statistics
     simulation = settings.get("simulation")
@@ -52,6 +52,7 @@ def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> d
             "restarts": {name: slave.restarts for name, slave in slaves},
             "requests": {name: slave.requests for name, slave in slaves},
             "compute_time": {name: slave.compute_time for name, slave in slaves},
+            "transport_time": {name: slave.transport_time for name, slave in slaves},
             **about_columns(Columns.of(start), settings),
             "settings_sha256": settings_sha256(settings),
             "settings": settings,

@@ -1,0 +1,271 @@
+"""Faults of slaves, disks, clocks and users, with real processes: see docs/reliability.md."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from master_node import Result
+from tests.test_processes import (
+    BOUND,
+    FOREVER,
+    Command,
+    Start,
+    assert_summary,
+    has_stepped,
+    slave_processes,
+    start,
+    system_file,
+    wait_until,
+    worker_of,
+)
+
+__all__ = ["start"]  # the fixture
+
+pytestmark = [
+    pytest.mark.skipif(os.name != "posix", reason="uses signals and limits"),
+    pytest.mark.usefixtures("no_process_left"),
+]
+
+SLOW = "stop_time = 0.4\nlargest_step_size = 2e-4\ninitial_step_size = 1e-4\n"
+"""A run of some seconds."""
+
+
+def in_process_files(start: Start, file: Path, directory: Path) -> list[bytes]:
+    """The results of an undisturbed run."""
+    master = start("master_node", "run", file, "--in-process", "--no-plot", "--output", directory)
+    assert master.wait(4 * BOUND) == 0, master.text
+    return files_of(directory)
+
+
+def files_of(directory: Path) -> list[bytes]:
+    """Results and steps of a run."""
+    return [(directory / name).read_bytes() for name in ("results.csv", "steps.csv")]
+
+
+# ---- A slave stops, crashes, hangs --------------------------------------------------------------
+
+
+def slow_car(folder: Path, fmu_dir: Path, bus: str = "") -> Path:
+    """The quarter car with so short steps that there is time to disturb it."""
+    file = system_file(
+        folder, fmu_dir / "chassis.fmu", fmu_dir / "wheel.fmu", simulation="", bus=bus
+    )
+    text = file.read_text().replace("initial_step_size = 1e-3\n", SLOW)
+    file.write_text(text)
+    return file
+
+
+@pytest.mark.parametrize("victim", ["node", "worker"])
+def test_a_slave_stopped_for_a_second_changes_nothing(
+    victim: str, start: Start, tmp_path: Path, fmu_dir: Path
+) -> None:
+    """SIGSTOP for 1 s in mid run: the master waits, and the results are the same bytes."""
+    file = slow_car(tmp_path, fmu_dir)
+    expected = in_process_files(start, file, tmp_path / "undisturbed")
+    master = start("master_node", "run", file, "--no-plot", "--output", tmp_path / "out")
+    master.wait_for("simulating")
+    wait_until(lambda: has_stepped(tmp_path / "out"))
+    node = slave_processes(master)["wheel"]
+    process = node if victim == "node" else worker_of(node)
+    process.suspend()
+    time.sleep(0.2)
+    rows = (tmp_path / "out" / "steps.csv").stat().st_size
+    time.sleep(0.8)
+    stopped = (tmp_path / "out" / "steps.csv").stat().st_size
+    process.resume()
+    assert master.wait(4 * BOUND) == 0, master.text
+    assert stopped < (tmp_path / "out" / "steps.csv").stat().st_size, "it was over before"
+    assert stopped - rows < 20_000, "it went on without its slave"
+    assert files_of(tmp_path / "out") == expected
+
+
+@pytest.mark.parametrize(
+    ("victim", "bus", "exit_code", "words"),
+    [
+        ("node", "reconnect_time = 1.0\n", 3, r"was lost and did not come back within 1 s"),
+        ("worker", "step_timeout = 1.0\n", 5, r"no reply within 1 s"),
+    ],
+)
+def test_a_slave_stopped_for_ever_ends_the_run(  # noqa: PLR0917
+    victim: str,
+    bus: str,
+    exit_code: int,
+    words: str,
+    start: Start,
+    tmp_path: Path,
+    fmu_dir: Path,
+) -> None:
+    """SIGSTOP without an end: slave, t, H and cause after the time that the user gave."""
+    file = system_file(
+        tmp_path,
+        fmu_dir / "chassis.fmu",
+        fmu_dir / "wheel.fmu",
+        simulation=FOREVER + 'recovery = "off"\n',
+        bus=bus,
+    )
+    master = start("master_node", "run", file, "--output", tmp_path / "out")
+    master.wait_for("simulating")
+    wait_until(lambda: has_stepped(tmp_path / "out"))
+    node = slave_processes(master)["wheel"]
+    (node if victim == "node" else worker_of(node)).suspend()
+    assert master.wait() == exit_code, master.text
+    last = master.text.splitlines()[-1]
+    assert re.match(rf"master-node: wheel: do_step at t=.* s, H=.* s: .*{words}", last), last
+    assert_summary(tmp_path / "out", "failed")
+
+
+def lag_file(folder: Path, fmu: Path, *, bus: str = "", slave: str = "") -> Path:
+    """One lag alone, 1 s with steps of 10 ms at most."""
+    path = folder / "lag.toml"
+    path.write_text(
+        "[simulation]\nstop_time = 1.0\ninitial_step_size = 1e-2\nlargest_step_size = 1e-2\n"
+        f'smallest_step_size = 1e-4\n[slaves.lag]\nmodel = "{fmu}"\n{slave}[bus]\n{bus}'
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("fmu", "exit_code", "words"),
+    [
+        ("crashes", 4, r"lag: do_step at t=.* s, H=.* s: the process that held the model died by"),
+        ("hangs", 5, r"lag: do_step at t=.* s, H=.* s: no reply within 1 s"),
+        ("not_finite", 4, r".*lag\.y.* is not finite"),
+    ],
+)
+def test_a_faulty_fmu_ends_the_run_and_nothing_else(  # noqa: PLR0917
+    fmu: str, exit_code: int, words: str, start: Start, tmp_path: Path, capability_dir: Path
+) -> None:
+    """SIGSEGV, an endless loop, infinity: cause and place in one line, results up to there."""
+    file = lag_file(tmp_path, capability_dir / f"{fmu}.fmu", bus="step_timeout = 1.0\n")
+    options = ("--no-examine", "--no-plot", "--output", tmp_path / "out")
+    master = start("master_node", "run", file, *options)
+    assert master.wait() == exit_code, master.text
+    last = master.text.splitlines()[-1]
+    assert re.search(f"^master-node: {words}", last), last
+    assert "SIGSEGV" in last or fmu != "crashes"
+    result = Result.load(tmp_path / "out")
+    assert result.summary["outcome"] == "failed"
+    assert 0.1 < result.time[-1] <= 0.25
+    assert all(map(float, result["lag.y"]))
+
+
+# ---- The user's machine -------------------------------------------------------------------------
+
+
+def test_a_full_disk_ends_the_run_with_readable_results(start: Start, tmp_path: Path) -> None:
+    """Exit code 7 naming the file; what was written before is whole. The limit is the system's."""
+    file = system_file(tmp_path, simulation=FOREVER)
+    code = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000));"
+        f"sys.argv = ['master-node', 'run', {str(file)!r}, '--in-process', '--no-plot',"
+        f" '--output', {str(tmp_path / 'out')!r}];"
+        "from master_node.cli import main; main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=4 * BOUND, check=False
+    )
+    assert done.returncode == 7, done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert re.match(r"master-node: cannot write .*\.csv: File too large; choose", last), last
+    result = Result.load(tmp_path / "out")
+    assert len(result.time) > 100
+    assert result.summary["outcome"] == "failed"
+
+
+JUMPING = """
+import os, time
+_wall = time.time
+_jumps = [0]
+def time_of_day():
+    _jumps[0] += 1
+    return _wall() + (86400.0 if _jumps[0] % 2 else -86400.0)
+time.time = time_of_day
+open(os.path.join(os.path.dirname(__file__), f"jumped-{os.getpid()}"), "w").close()
+"""
+
+
+def test_a_jump_of_the_wall_clock_changes_nothing(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In all processes the time of day jumps by a day at every look; no wait depends on it."""
+    file = system_file(tmp_path, simulation="stop_time = 0.2\n")
+    expected = in_process_files(start, file, tmp_path / "undisturbed")
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(JUMPING)
+    path = os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")])
+    monkeypatch.setenv("PYTHONPATH", path.rstrip(os.pathsep))
+    master = start("master_node", "run", file, "--no-plot", "--output", tmp_path / "out")
+    assert master.wait() == 0, master.text
+    assert files_of(tmp_path / "out") == expected
+    assert len(list((tmp_path / "site").glob("jumped-*"))) >= 5, "a master, two nodes, two workers"
+
+
+STUBBORN = '''
+from pathlib import Path
+from time import sleep
+from slave_node.model import Model, real
+
+class Stubborn(Model):
+    """Hears no interrupt."""
+
+    states = (real("x"),)
+    outputs = states
+
+    def derivatives(self, t, x, u):
+        Path(__file__).with_name("begun").touch()
+        while True:
+            try:
+                sleep(60.0)
+            except KeyboardInterrupt:
+                Path(__file__).with_name("ignored").touch()
+'''
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_ctrl_c_kills(number: signal.Signals, start: Start, tmp_path: Path) -> None:
+    """When the first one cannot end the run, as a model in process swallows it, the second does."""
+    (tmp_path / "stubborn.py").write_text(STUBBORN)
+    file = tmp_path / "stubborn.toml"
+    file.write_text(
+        "[simulation]\nstop_time = 1.0\n[slaves.stubborn]\n"
+        f'model = "{tmp_path / "stubborn.py"}:Stubborn"\n'
+    )
+    options = ("--in-process", "--no-examine", "--output", tmp_path / "out")
+    master: Command = start("master_node", "run", file, *options)
+    wait_until((tmp_path / "begun").exists)
+    master.send(number)
+    wait_until((tmp_path / "ignored").exists)
+    master.send(number)
+    assert master.wait() == -number
+
+
+# ---- The wrong model ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [(), ("--in-process",)], ids=["launched", "in process"])
+def test_a_model_with_another_hash_is_refused(
+    options: tuple[str, ...], start: Start, tmp_path: Path, fmu_dir: Path
+) -> None:
+    """Exit code 2 before a step, with both hashes; with the right one, in any case, it runs."""
+    file = system_file(tmp_path, fmu_dir / "chassis.fmu", fmu_dir / "wheel.fmu")
+    text = file.read_text()
+    right = hashlib.sha256((fmu_dir / "wheel.fmu").read_bytes()).hexdigest()
+    for given, exit_code in (("0" * 64, 2), (right.upper(), 0)):
+        file.write_text(text.replace("[slaves.wheel]", f'[slaves.wheel]\nsha256 = "{given}"'))
+        out = tmp_path / f"out {exit_code}"
+        master = start("master_node", "run", file, "--no-plot", "--output", out, *options)
+        assert master.wait() == exit_code, master.text
+        if exit_code:
+            last = master.text.splitlines()[-1]
+            assert f"[slaves.wheel] sha256 = '{given}'" in last
+            assert right in last
+            assert not (out / "results.csv").exists()
