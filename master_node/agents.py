@@ -92,6 +92,8 @@ class Agents:
         self._arrived = monotonic() + _ARRIVAL_TIME
         self._deadline = monotonic() + system.bus.discovery_timeout
         self._placed: dict[str, _Placed] = {}
+        self._used: set[AgentKey] = set()
+        self._restarts: dict[str, int] = {}
         self._ended: dict[str, DoublestepError] = {}
         self._next_check = 0.0
 
@@ -138,6 +140,18 @@ class Agents:
                 if monotonic() > self._deadline:
                     raise self._nobody(name, settings, seen) from None
             sleep(_PAUSE)
+
+    def restart(self, name: str) -> SlaveKey:
+        """Have slave ``name`` started once more, by another agent if the first does not answer.
+
+        Raises:
+            DoublestepError: as `start`.
+        """
+        self._deadline = monotonic() + self._system.bus.discovery_timeout
+        self._placed.pop(name, None)
+        self._ended.pop(name, None)
+        self._restarts[name] = self._restarts.get(name, 0) + 1
+        return self.start(name)
 
     def verify(self, descriptions: Mapping[str, SlaveDescription]) -> None:
         """Check that the agents have loaded the models that were meant.
@@ -211,13 +225,14 @@ class Agents:
     def stop(self, *, at_once: bool = False) -> None:  # noqa: ARG002  agents bound it themselves
         """See `Starter`."""
         pending: list[PendingReply] = []
-        for key in {placed.key for placed in self._placed.values()}:
+        for key in self._used:
             try:
                 caller = self._bus.caller(key.verb(STOP), _STOP_TIME)
                 pending.append(caller.send(encode_record(StopRun(self._run))))
             except DoublestepError:
                 continue
         self._placed.clear()
+        self._used.clear()
         for reply in pending:
             try:
                 decode_record(Done, reply.result())
@@ -281,7 +296,9 @@ class Agents:
             slave=wanted.slave,
             model=model,
             requires=requires,
+            restart=self._restarts.get(wanted.slave, 0),
         )
+        self._used.add(seen.key)
         started = ask_agent(self._bus, seen.key, START, request, SlaveStarted, timeout=_START_TIME)
         self._placed[wanted.slave] = _Placed(seen.status, seen.key, sha256)
         where = printable(f"{seen.key.name} on {seen.status.host}")

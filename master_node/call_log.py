@@ -30,15 +30,17 @@ from protocol.calls import (
     GetState,
     Reset,
     SerializeState,
+    SetInputs,
     SetState,
-    StepResult,
 )
 from protocol.codec import MAX_CALLS, decode_program, encode_program
 from protocol.slave import StepStatus
 
 _DIGEST_SIZE = 8
 _LENGTH = Struct("<I")
-_WITHOUT_TRACE = (Describe, Examine, SerializeState, DeserializeState)
+_WITHOUT_TRACE = frozenset((Describe, Examine, SerializeState, DeserializeState))
+_OF_STEPS = frozenset((SetInputs, DoStep, GetOutputs, GetDiscreteOutputs))
+_OF_STATES = frozenset((GetState, SetState, FreeState))
 
 KEPT_STEPS = 10_000
 """About 10 MB for each slave."""
@@ -179,17 +181,19 @@ class CallLog:
         """The slave has executed ``calls``, as far as there are ``results``."""
         for call, result in zip(calls, results, strict=False):
             kind = type(call)
-            if kind in _WITHOUT_TRACE:
-                continue
-            if kind is Configure or kind is Reset:
+            if self._is_running and kind in _OF_STEPS:
+                if kind is DoStep and result.status is not StepStatus.OK:  # type: ignore[attr-defined]
+                    return  # it goes back from there, or no further
+                self._present.append(call)
+                if kind is not SetInputs and kind is not DoStep:
+                    self._outputs.append(result)
+            elif kind in _OF_STATES:
+                self._note_state(call)
+            elif kind is Configure or kind is Reset:
                 self._begin_anew(call)
-            elif not self._is_running:
-                self._beginning.append(call)
-                self._is_running = kind is ExitInitializationMode
-            elif type(result) is StepResult and result.status is not StepStatus.OK:
-                return  # it goes back from there, or no further
-            else:
-                self._note(call, result)
+            elif kind not in _WITHOUT_TRACE:
+                (self._present if self._is_running else self._beginning).append(call)
+                self._is_running = self._is_running or kind is ExitInitializationMode
 
     def _begin_anew(self, call: Call) -> None:
         is_reset = type(call) is Reset
@@ -203,17 +207,14 @@ class CallLog:
     def _forget_present(self) -> None:
         self._present, self._outputs, self._marks = [], [], {}
 
-    def _note(self, call: Call, result: object) -> None:
-        kind = type(call)
-        if kind is SetState:
-            self._go_back(call.state)  # type: ignore[union-attr]
+    def _note_state(self, call: Call) -> None:
+        if isinstance(call, SetState):
+            self._go_back(call.state)
         self._present.append(call)
-        if kind is GetOutputs or kind is GetDiscreteOutputs:
-            self._outputs.append(result)
-        elif kind is GetState:
-            self._marks[call.state] = len(self._present), len(self._outputs)  # type: ignore[union-attr]
-        elif kind is FreeState or (kind is SetState and call.free):  # type: ignore[union-attr]
-            self._marks.pop(call.state, None)  # type: ignore[union-attr]
+        if isinstance(call, GetState):
+            self._marks[call.state] = len(self._present), len(self._outputs)
+        elif isinstance(call, FreeState) or (isinstance(call, SetState) and call.free):
+            self._marks.pop(call.state, None)
 
     def _go_back(self, state: int) -> None:
         mark = self._marks.get(state)

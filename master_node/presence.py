@@ -101,7 +101,7 @@ class Presence:
                 found[name] = instances[0]
         return found
 
-    def wait_for(self, key: SlaveKey, launcher: Starter, timeout: float) -> None:
+    def wait_for(self, key: SlaveKey, starter: Starter, timeout: float) -> None:
         """Wait until a slave that was started again is alive.
 
         Raises:
@@ -111,7 +111,7 @@ class Presence:
         deadline = self._clock.monotonic() + timeout
         with self._changed:
             while key not in self._alive:
-                error = launcher.ended(key.name)
+                error = starter.ended(key.name)
                 if error is not None:
                     raise error
                 if self._clock.monotonic() > deadline:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from master_node.configuration import System
-from master_node.launcher import Launcher
+from master_node.launcher import Starter
 from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
-from protocol.errors import ConfigurationError, DoublestepError, SlaveLostError
+from protocol.errors import DoublestepError, SlaveLostError
 from protocol.keys import SlaveKey
 
 
@@ -19,9 +19,10 @@ class Restarts:
         system: what is run.
         remotes: the slaves by name; the present ones, kept up to date here.
         claim: claims the slave at a key for this run.
-        launcher: of the slaves that were started here.
+        start: starts a slave of this run once more, here or by an agent; gives its address, and who
+            can say what becomes of it.
         presence: follows the slaves' tokens.
-        launched: names of the slaves that were started here.
+        started: names of the slaves that were started for this run.
     """
 
     def __init__(  # noqa: PLR0917  what starting a slave takes
@@ -29,20 +30,20 @@ class Restarts:
         system: System,
         remotes: dict[str, RemoteSlave],
         claim: Callable[[SlaveKey], RemoteSlave],
-        launcher: Launcher,
+        start: Callable[[str], tuple[SlaveKey, Starter]],
         presence: Presence,
-        launched: frozenset[str],
+        started: frozenset[str],
     ) -> None:
         self._system = system
         self._remotes = remotes
         self._claim = claim
-        self._launcher = launcher
+        self._start = start
         self._presence = presence
-        self._launched = launched
+        self._started = started
 
     def is_mine(self, name: str) -> bool:
         """Whether the slave of that name is one that can be started again here."""
-        return name in self._launched
+        return name in self._started
 
     def restart(self, name: str) -> RemoteSlave:
         """A slave as it was loaded first.
@@ -62,18 +63,15 @@ class Restarts:
             try:
                 remote.renew()
             except DoublestepError:
-                if name not in self._launched:
+                if name not in self._started:
                     raise
             else:
                 return remote
-        if name not in self._launched:
-            raise SlaveLostError("its process is gone, and it was not started by this master")
-        model = self._system.slaves[name].model
-        if model is None:
-            raise ConfigurationError(f"[slaves.{name}] has no model to start")
+        if name not in self._started:
+            raise SlaveLostError("its process is gone, and it was not started for this run")
         self._presence.forget(remote)
-        key = self._launcher.launch(name, model, self._system.base)
-        self._presence.wait_for(key, self._launcher, self._system.bus.discovery_timeout)
+        key, starter = self._start(name)
+        self._presence.wait_for(key, starter, self._system.bus.discovery_timeout)
         self._remotes[name] = remote = self._claim(key)
         self._presence.follow(remote)
         return remote

@@ -179,10 +179,10 @@ class RestorableSlave:
         self.log.settle()
 
     def _note(self, reply: Reply) -> None:
-        for call, result in zip(self._calls, reply.results, strict=False):
-            if type(call) is Configure:
-                assert isinstance(result, SlaveDescription)
-                self._describe(result)
+        if type(self._calls[0]) is Configure and reply.results:  # a program of its own
+            (result,) = reply.results
+            assert isinstance(result, SlaveDescription)
+            self._describe(result)
         self.log.note(self._calls, reply.results)
 
     def _can_be_broken(self, failure: DoublestepError) -> bool:

@@ -52,7 +52,7 @@ class Slaves:
         links: to each of them.
         descriptions: what each said of itself.
         starters: of those that were started for this run.
-        restarts: starts those of this host again, None in process.
+        restarts: starts them again, None in process and without recovery.
     """
 
     links: Mapping[str, SlaveLink]
@@ -173,10 +173,17 @@ def slaves_on_bus(
                 {name: keys[name] for name in system.slaves},
                 why_ended,
                 reconnect_time=system.bus.reconnect_time,
-                can_restart=lambda name: recovers and name in launched,
+                can_restart=lambda name: recovers and name in started,
             )
         )
-        restarts = Restarts(system, remotes, claim, launcher, presence, frozenset(launched))
+
+        def start_again(name: str) -> tuple[SlaveKey, Starter]:
+            if name in elsewhere:
+                return agents.restart(name), agents
+            model = str(system.slaves[name].model)
+            return launcher.launch(name, model, system.base), launcher
+
+        restarts = Restarts(system, remotes, claim, start_again, presence, frozenset(started))
         slaves = Slaves(dict(remotes), describe(remotes), starters, restarts if recovers else None)
         agents.verify(slaves.descriptions)
         try:

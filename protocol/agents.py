@@ -195,10 +195,12 @@ class StartSlave:
         model: name of a file that the agent has, without folders, or the SHA-256 of one; for a
             Python model ``package.module:Class`` or ``file.py:Class``.
         requires: labels that the agent must have; a counted licence is taken.
+        restart: how often the run has started this slave before. What an agent has started for a
+            smaller number is ended.
 
     Raises:
         ConfigurationError: a name is not valid.
-        MalformedMessageError: ``orphan_time`` is out of range.
+        MalformedMessageError: ``orphan_time`` or ``restart`` is out of range.
     """
 
     run: str
@@ -208,10 +210,13 @@ class StartSlave:
     slave: str
     model: str
     requires: Mapping[str, str]
+    restart: int = 0
 
     def __post_init__(self) -> None:
         check_name(self.run, "run id")
         check_name(self.slave)
+        if self.restart < 0:
+            raise MalformedMessageError("restart must not be negative")
         if not 0.0 <= self.orphan_time <= MAX_ORPHAN_TIME:  # NaN is not
             raise MalformedMessageError(f"orphan_time must be from 0 to {MAX_ORPHAN_TIME:g} s")
         for name, value in self.requires.items():

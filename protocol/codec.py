@@ -794,6 +794,7 @@ _RECORD_FIELDS: Mapping[type, Mapping[str, _Check]] = {
         "slave": _text,
         "model": _text,
         "requires": _texts_by_name,
+        "restart": _integer,
     },
     SlaveStarted: {"instance": _text, "pid": _integer},
     StopRun: {"run": _text},

@@ -244,6 +244,8 @@ class Agent:
     def start(self, request: StartSlave) -> SlaveStarted:
         """Start a slave; the same request again gets the same answer.
 
+        One with a larger number of restarts takes the place of what was started before.
+
         Raises:
             ConfigurationError: a label is missing, or the process cannot be started.
             ModelError: there is no such model, or it may not be started.
@@ -254,8 +256,11 @@ class Agent:
             started = run.slaves.get(request.slave) if run else None
             if started is not None and started[0] == request:
                 return SlaveStarted(started[1].key.instance, started[1].pid)
-            if started is not None or (run is not None and run.ending):
+            is_again = started is not None and started[0].restart < request.restart
+            if (started is not None and not is_again) or (run is not None and run.ending):
                 raise SlaveBusyError(f"run {request.run} has ended, or has another such slave")
+            if started is not None:
+                end_all([started[1]], at_once=True)
             self._check(request)
             base, model = self._model(request.model)
             process = self._process(model, base, request.slave, request.run)

@@ -23,7 +23,7 @@ from typing import Any
 import psutil
 import pytest
 
-from master_node import System, load_system, simulate
+from master_node import Result, System, load_system, simulate
 from master_node.agent_models import Sent
 from master_node.agents import Agents
 from master_node.simulation import run as run_system
@@ -618,6 +618,12 @@ def test_a_repeated_start_takes_effect_once_and_a_dead_process_holds_no_licence(
         served.ask(START, request("other", requires={"licence": "dymola"}), SlaveStarted)
     with pytest.raises(SlaveBusyError, match="another such slave"):
         served.ask(START, request(model="chassis.fmu"), SlaveStarted)
+    again = served.ask(START, replace(wanted, restart=1), SlaveStarted)
+    assert again != started
+    assert not psutil.pid_exists(started.pid)
+    with pytest.raises(SlaveBusyError, match="another such slave"):
+        served.ask(START, wanted, SlaveStarted)
+    started = again
     with pytest.raises(ConfigurationError, match=r"it has no os = windows; .*--label os=windows"):
         served.ask(START, request("other", requires={"os": "windows"}), SlaveStarted)
     psutil.Process(started.pid).kill()
@@ -897,7 +903,8 @@ def test_what_became_of_a_slave_is_told_by_its_agent(
     with pytest.raises(ModelError, match=r"wheel: on .* \(agent winbox\): .*modelDescription\.xml"):
         simulate(load_system(file))
     wheel = {"model": "wheel.fmu", "host": "winbox"}
-    file = system_file(tmp_path, chassis, wheel, simulation=FOREVER, bus=listening(endpoint))
+    forever = FOREVER + "recovery = 'off'\n"
+    file = system_file(tmp_path, chassis, wheel, simulation=forever, bus=listening(endpoint))
     out = tmp_path / "out"
     master = start("master_node", "run", file, "--output", out, "--no-plot")
     wait_until(lambda: has_stepped(out))
@@ -912,6 +919,47 @@ def test_what_became_of_a_slave_is_told_by_its_agent(
         + re.escape(f"{log} on {socket.gethostname()}"),
         last,
     ), last
+
+
+@pytest.mark.parametrize("victim", ["slave", "agent"])
+def test_a_slave_that_is_lost_is_started_again_elsewhere_if_need_be(  # noqa: PLR0917  fixtures
+    victim: str,
+    start: Commands,
+    start_agent: StartAgent,
+    tmp_path: Path,
+    fmu_dir: Path,
+    endpoint: str,
+) -> None:
+    """SIGKILL in mid run: by the same agent, or by another one with the labels; the same bits."""
+    simulation = "stop_time = 4.0\nlargest_step_size = 1e-3\n"
+    agents = {
+        name: start_agent(name, "--label", "os=any", "--connect", endpoint) for name in ("a", "b")
+    }
+    file = system_file(
+        tmp_path,
+        {"model": fmu_dir / "chassis.fmu"},
+        {"model": "wheel.fmu", "requires": {"os": "any"}},
+        simulation=simulation,
+        bus=listening(endpoint),
+    )
+    out = tmp_path / "out"
+    master = start("master_node", "run", file, "--output", out, "--no-plot")
+    wait_until(lambda: has_stepped(out))
+    if victim == "agent":
+        agents["a"].send(signal.SIGKILL)
+    else:
+        slave_processes(agents["a"])["wheel"].kill()
+    master.wait_for("started again and restored")
+    where = slave_processes(agents["b" if victim == "agent" else "a"])
+    assert list(where) == ["wheel"]
+    assert Result.load(out).summary == {}
+    assert master.wait() == 0, master.text
+    slaves = {name: {"model": fmu_dir / f"{name}.fmu"} for name in ("chassis", "wheel")}
+    undisturbed = load_system(system_file(tmp_path, **slaves, simulation=simulation))
+    simulate(undisturbed, output=tmp_path / "undisturbed", in_process=True)
+    for name in ("results.csv", "steps.csv"):
+        assert (out / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
+    assert slave_processes(agents["b"]) == {}
 
 
 @pytest.mark.parametrize("victim", ["agent", "master"])
@@ -931,7 +979,7 @@ def test_nothing_outlives_who_it_works_for(  # noqa: PLR0917  fixtures
         tmp_path,
         {"model": fmu_dir / "chassis.fmu"},
         {"model": fmu_dir / "wheel.fmu", "host": "winbox"},
-        simulation=FOREVER,
+        simulation=FOREVER + "recovery = 'off'\n",
         bus=listening(endpoint),
     )
     out = tmp_path / "out"
