@@ -181,7 +181,9 @@ def test_a_router_between_all_and_its_restart(
     second = start("slave_node", "router", "--listen", endpoint)
     assert master.wait() == 0, master.text
     assert (tmp_path / "out" / "results.csv").read_bytes() == reference(tmp_path)
-    assert "WARNING: the connection to chassis, wheel was lost" in master.text
+    assert re.search(
+        "WARNING: the connection to (chassis|wheel|chassis, wheel) was lost", master.text
+    )
     second.send(signal.SIGTERM)
     assert second.wait() == 0
     assert "ending: SIGTERM" in second.text
