@@ -6,7 +6,6 @@ Every message names file, table and key. ``docs/system-file.md`` explains each k
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -33,6 +32,7 @@ from pydantic_core import ErrorDetails
 
 from master_node.numerics.dense_output import OutputGrid
 from master_node.numerics.extrapolation import InputPolynomial
+from master_node.toml_files import read_located_tables
 from protocol.agents import check_label
 from protocol.errors import ConfigurationError
 from protocol.keys import check_name
@@ -681,16 +681,7 @@ def load_system(path: Path) -> System:
     Raises:
         ConfigurationError: it is missing or wrong; the message has a line for each mistake.
     """
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path}: not a TOML file: {error}") from error
-    for reserved in ("base", "source"):
-        if reserved in tables:
-            raise ConfigurationError(f"{path}: {reserved}: unknown table or key")
-    return System(**tables, base=path.absolute().parent, source=str(path))
+    return System(**read_located_tables(path))
 
 
 def configuration_error(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
 import tomli_w
 
 from master_node.configuration import Scalar, System
+from master_node.toml_files import read_tables
 from protocol.errors import ConfigurationError
 
 Case = Mapping[str, Scalar]
@@ -44,12 +44,7 @@ def read_case(path: Path) -> Case:
     Raises:
         ConfigurationError: it is missing, or is not a case.
     """
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path}: not a TOML file: {error}") from error
+    tables = read_tables(path)
     case = tables.pop(_TABLE, None)
     if tables or not isinstance(case, dict):
         raise ConfigurationError(f"{path}: not a case: it needs a table [{_TABLE}] and no other")

@@ -5,7 +5,6 @@ Every message names file, table and key. ``docs/sweep.md`` explains each key to 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -27,6 +26,7 @@ from pydantic import (
 
 from master_node.configuration import Number, Positive, Reference, Scalar, configuration_error
 from master_node.numerics.reductions import REDUCTIONS
+from master_node.toml_files import read_located_tables
 from protocol.errors import ConfigurationError
 from protocol.keys import check_name
 from protocol.names import nearest
@@ -286,16 +286,7 @@ def load_study(path: Path) -> Study:
     Raises:
         ConfigurationError: it is missing or wrong; the message has a line for each mistake.
     """
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path}: not a TOML file: {error}") from error
-    for reserved in ("base", "source"):
-        if reserved in tables:
-            raise ConfigurationError(f"{path}: {reserved}: unknown table or key")
-    return Study(**tables, base=path.absolute().parent, source=str(path))
+    return Study(**read_located_tables(path))
 
 
 def _known_keys(place: list[str]) -> list[str]:
