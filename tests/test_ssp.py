@@ -819,7 +819,10 @@ def test_what_does_not_fit_is_noted(packages: Packages) -> None:
         )
     )
     assert read.system.slaves["wheel"].parameters == {"m": 40000.0}
-    assert "the value for wheel.m has the unit 'g', the variable 'kg'" in read.notes[0]
+    assert (
+        "the value for wheel.m has the unit 'g', which is not converted to its unit 'kg'"
+        in read.notes[0]
+    )
     assert "no variable of 'wheel' has the name 'mass'; not applied" in read.notes[1]
     assert "inputs of the whole system 'u': nothing drives them" in read.notes[2]
     assert read.system.connections == ()
@@ -858,16 +861,28 @@ def test_types_of_values(packages: Packages, value: str, expected: object) -> No
         ('<ssv:Real value=""/>', "'value' is missing"),
         ('<ssv:Integer value="1.5"/>', "'1.5' is not a whole number"),
         ('<ssv:Boolean value="yes"/>', "'yes' is neither true nor false"),
-        ('<ssv:Binary value="00"/>', "a Binary value"),
+        ('<ssv:Binary value="00"/>', "a Binary for wheel.m, which is of type Real"),
+        ('<ssv:Binary value="0"/>', "value = '0' is not hexadecimal"),
         ('<ssv:Enumeration value="on"/>', "Enumeration item 'on' has no number"),
-        ('<ssv:Real value="1 2"/><ssc:Dimension size="2"/>', "an array"),
+        ('<ssv:Real value="1 2"/><ssc:Dimension size="2"/>', "an array for wheel.m"),
+        ('<ssv:Real value="1 2"/>', "has 2 values in place of one value"),
+        ('<ssv:Real value="1 2 3"/><ssc:Dimension size="2"/>', "has 3 values in place of 2"),
+        ('<ssv:Real value="1 2"/><ssc:Dimension/>', "needs a size"),
+        ('<ssv:Real value="1"/><ssc:Dimension size="0"/>', "an array of size 0"),
+        ('<ssv:Real value="1"/><ssc:Dimension size="100001"/>', "1 to 100000 elements"),
+        (
+            '<ssv:Real value="1"/><ssc:Dimension size="1" sizeConnector="n"/>',
+            "has both size and sizeConnector",
+        ),
+        ('<ssv:Real value="1" unit="mm"/>', "unit 'mm' cannot be converted to 'kg'"),
         ('<ssv:Real value="1"/><ssv:Integer value="1"/>', "needs one element"),
         ('<ssv:Complex value="1"/>', "needs one element"),
     ],
 )
 def test_values_that_cannot_be_used_are_named(packages: Packages, value: str, told: str) -> None:
     """With file and line."""
-    text = binding(f'<ssv:Parameter name="m">{value}</ssv:Parameter>')
+    units = UNITS.replace("ssd:", "ssv:")
+    text = binding(f'<ssv:Parameter name="m">{value}</ssv:Parameter>', after=units)
     refused = packages.refusal(ssd(system(component("wheel", INPUTS, bindings(text)))))
     assert told in refused
     assert "SystemStructure.ssd, line 3" in refused
@@ -921,7 +936,7 @@ def test_values_that_cannot_be_used_are_named(packages: Packages, value: str, to
         ),
         (
             ssd(system(WHEEL + '<ssd:SignalDictionaryReference name="b" dictionary="d"/>')),
-            "signal dictionaries are not supported",
+            "no signal dictionary 'd'",
         ),
         (
             ssd(system(component("wheel", connector("x_c", "sideways")))),
@@ -929,7 +944,7 @@ def test_values_that_cannot_be_used_are_named(packages: Packages, value: str, to
         ),
         (
             ssd(system(component("wheel", connector("x_c", "input", "furlong")))),
-            "unit 'furlong' is not in ssd:Units",
+            "unit 'furlong' is not in the Units of the file",
         ),
     ],
 )
@@ -946,6 +961,7 @@ MAPPED = (
     '<ssc:BooleanMappingTransformation><ssc:MapEntry source="true" target="false"/>'
     "</ssc:BooleanMappingTransformation>"
 )
+TWICE = '<ssc:MapEntry source="1" target="1"/><ssc:Map'
 ENUMERATED = (
     '<ssc:EnumerationMappingTransformation><ssc:MapEntry source="a" target="b"/>'
     "</ssc:EnumerationMappingTransformation>"
@@ -955,26 +971,44 @@ ENUMERATED = (
 @pytest.mark.parametrize(
     ("connections", "told"),
     [
-        (connection("chassis.x", "wheel.x_c", MAPPED), "a mapping transformation of a connection"),
         (
             connection("chassis.x", "wheel.x_c", ENUMERATED),
-            "ssc:EnumerationMappingTransformation of a connection is not supported",
+            "EnumerationMappingTransformation: connector 'x' has no item 'a'",
+        ),
+        (
+            connection("chassis.x", "s.in", MAPPED),
+            "a BooleanMappingTransformation and a LinearTransformation lie on the way",
+        ),
+        (
+            connection("chassis.x", "wheel.x_c", MAPPED.replace("<ssc:Map", TWICE)),
+            "the source True is there twice",
+        ),
+        (
+            connection("chassis.x", "wheel.x_c", MAPPED.replace("ssc:MapEntry", "ssc:Strange")),
+            "ssc:Strange: is not supported in ssc:BooleanMappingTransformation",
         ),
         (connection("chassis.x", "chassis.v"), "has no direction"),
         (connection("chassis.x", "whel.x_c"), "no element 'whel'; did you mean 'wheel'?"),
         (connection("chassis.x", "wheel.x_d"), "no connector 'x_d'; did you mean 'x_c'?"),
         (
             connection("chassis.x", "wheel.x_c") + connection("chassis.v", "wheel.x_c"),
-            "connector 'x_c' has two sources",
+            "connector 'wheel.x_c' has two sources",
         ),
         (
             connection("chassis.x", "wheel.x_c", attributes='startIndices="1"'),
-            "elements of arrays cannot be connected",
+            "1 indices for connector 'x' of kind 'output', which has 0 dimensions",
         ),
-        (connection("chassis.x", "wheel.array"), "cannot be connected: an array"),
-        (connection("chassis.x", "wheel.binary"), "cannot be connected: type ssc:Binary"),
+        (
+            connection("chassis.x", "wheel.array", attributes='endIndices="0"'),
+            "endIndices: an index below 1",
+        ),
+        (
+            connection("chassis.x", "wheel.array", attributes='endIndices="3"'),
+            "has no index 3, only 2",
+        ),
+        (connection("chassis.x", "wheel.array"), "have different dimensions: one value and 2"),
         (connection("chassis.x", "wheel.clocked"), "cannot be connected: a clock"),
-        (connection("chassis.x", "wheel.any"), "cannot be connected: kind unspecified"),
+        (connection("wheel.any", "s.any"), "of kinds 'unspecified' and 'unspecified' has no dir"),
         (connection("chassis.k", "wheel.x_c"), "from kind 'constant' to kind 'input'"),
         (connection("chassis.x", "wheel.z"), "from kind 'output' to kind 'parameter'"),
         (
@@ -991,7 +1025,6 @@ def test_connections_that_are_not_supported_are_refused_by_name(
         "wheel",
         INPUTS
         + connector("array", "input", inner='<ssc:Real/><ssc:Dimension size="2"/>')
-        + connector("binary", "input", inner="<ssc:Binary/>")
         + connector("clocked", "input", inner='<ssc:Real/><ssc:Clock name="c"/>')
         + connector("any", "unspecified")
         + connector("z", "parameter"),
@@ -1001,11 +1034,12 @@ def test_connections_that_are_not_supported_are_refused_by_name(
         '<ssd:System name="s"><ssd:Connectors>'
         + connector("in", "input")
         + connector("out", "output")
+        + connector("any", "unspecified")
         + "</ssd:Connectors><ssd:Elements>"
         + WHEEL
         + "</ssd:Elements><ssd:Connections>"
         + connection("in", "out")
-        + connection("in", "wheel.x_c")
+        + connection("in", "wheel.x_c", linear(2, 1))
         + "</ssd:Connections></ssd:System>"
     )
     refused = packages.refusal(ssd(system(wheel + chassis + looped, connections)))
@@ -1024,7 +1058,7 @@ def test_connections_that_are_not_supported_are_refused_by_name(
         (binding(real("m", 1) + real("m", 2)), "'m' is there twice"),
         (binding(real("m", 1), entry("m", "z") + entry("m", "z")), "are mapped to 'z'"),
         (binding(real("m", 1), entry("m", "z", ENUMERATED)), "Enumeration"),
-        (binding(real("m", 1), entry("m", "z", MAPPED)), "no MapEntry for the value 1.0"),
+        (binding(real("m", 1), entry("m", "z", MAPPED)), "a BooleanMappingTransformation of 1.0"),
     ],
 )
 def test_bindings_that_are_not_supported_are_refused_by_name(
