@@ -15,12 +15,14 @@ from hypothesis import strategies as st
 from lxml import etree
 from typer.testing import CliRunner
 
-from master_node import System, load_system, open_system
+from master_node import System, load_system, open_system, simulate
 from master_node.cli import app
-from master_node.ssp.structure import Linear, Unit
+from master_node.ssp.structure import Linear, Table, Unit
 from master_node.system_files import ImportedSystem, export_system, import_system, read_ssp
 from protocol.errors import ConfigurationError, ModelError
 from tests.quarter_car_case import EXAMPLES
+
+pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
 
 SCHEMAS = Path(fmpy.ssp.__file__).parent / "schema"
 NAMESPACES = "".join(
@@ -30,6 +32,7 @@ NAMESPACES = "".join(
         ("ssd", "Description"),
         ("ssv", "ParameterValues"),
         ("ssm", "ParameterMapping"),
+        ("ssb", "SignalDictionary"),
     )
 )
 UNITS = (
@@ -693,6 +696,378 @@ def test_names_that_slaves_cannot_have(packages: Packages) -> None:
     assert "two components get the name 'my_wheel'" in packages.refusal(ssd(system(two)))
 
 
+# ---- Mappings of connections, arrays, binaries --------------------------------------------------
+
+
+def table(kind: str, **entries: object) -> str:
+    """A mapping transformation; a name that begins with _ stands for what is behind it."""
+    rows = "".join(
+        f'<ssc:MapEntry source="{source.removeprefix("_")}" target="{target}"/>'
+        for source, target in entries.items()
+    )
+    return f"<ssc:{kind}MappingTransformation>{rows}</ssc:{kind}MappingTransformation>"
+
+
+def through(first: str, second: str, inner: str, target_inner: str = "") -> str:
+    """chassis.x to a system and on to wheel.x_c, with a transformation each."""
+    inside = (
+        '<ssd:System name="s">'
+        + system(
+            component("wheel", connector("x_c", "input", inner=target_inner or inner)),
+            connection("a", "wheel.x_c", second),
+            f"<ssd:Connectors>{connector('a', 'input', inner=inner)}</ssd:Connectors>",
+        )
+        + "</ssd:System>"
+    )
+    source = component("chassis", connector("x", "output", inner=inner))
+    enumerations = "".join(
+        f'<ssc:Enumeration name="{name}">'
+        + "".join(f'<ssc:Item name="{i}" value="{v}"/>' for i, v in items.items())
+        + "</ssc:Enumeration>"
+        for name, items in (("gear", {"low": 1, "high": 2}), ("mode", {"slow": 7, "fast": 9}))
+    )
+    return ssd(
+        system(source + inside, connection("chassis.x", "s.a", first)),
+        f"<ssd:Enumerations>{enumerations}</ssd:Enumerations>",
+    )
+
+
+GEAR, MODE = ('<ssc:Enumeration name="%s"/>' % name for name in ("gear", "mode"))  # noqa: UP031
+
+
+@pytest.mark.parametrize(
+    ("description", "mapping"),
+    [
+        (
+            through(table("Boolean", true="0", false="1"), "", "<ssc:Boolean/>"),
+            {True: False, False: True},
+        ),
+        (
+            through(table("Integer", _1=2, _2=3), table("Integer", _3=5, _4=4), "<ssc:Int32/>"),
+            {1: 2, 2: 5, 3: 5, 4: 4},
+        ),
+        (
+            through("", table("Enumeration", low="fast", high="slow"), GEAR, MODE),
+            {1: 9, 2: 7},
+        ),
+        (
+            through(table("Enumeration", low="high"), table("Integer", _2=7), GEAR, MODE),
+            {1: 7, 2: 7},
+        ),
+    ],
+)
+def test_mapping_transformations_of_connections(
+    packages: Packages, description: str, mapping: dict[int, int]
+) -> None:
+    """Composed on the way of a signal; what has no entry stays, items become numbers."""
+    read = packages.read(description)
+    (one,) = read.system.connections
+    assert one.mapping == mapping
+    assert list(map(type, one.mapping or ())) == list(map(type, mapping))
+    assert read.notes == ()
+
+
+@given(
+    tables=st.lists(
+        st.dictionaries(st.integers(0, 5), st.integers(0, 5), min_size=1), min_size=1, max_size=4
+    )
+)
+def test_tables_are_composed(tables: list[dict[int, int]]) -> None:
+    """Each value becomes what all on its way make of it, one after the other."""
+    whole = Table(tables[0], is_boolean=False)
+    for entries in tables[1:]:
+        whole = whole.then(Table(entries, is_boolean=False))
+    for value in range(8):
+        expected = value
+        for entries in tables:
+            expected = entries.get(expected, expected)
+        assert whole(value) == expected
+
+
+VECTOR = '<ssc:Float64/><ssc:Dimension size="3"/>'
+MATRIX = '<ssc:Float64/><ssc:Dimension size="2"/><ssc:Dimension size="3"/>'
+SIZED = '<ssc:Float64/><ssc:Dimension sizeConnector="n"/>'
+
+
+def array_component(name: str, connectors: str, values: str = "") -> str:
+    """A component with the FMU of all types of FMI 3.0."""
+    return component(name, connectors, values, 'source="resources/all_types3.fmu"')
+
+
+def array(name: str, kind: str, texts: str, *sizes: int) -> str:
+    """A parameter that is an array of numbers."""
+    dimensions = "".join(f'<ssc:Dimension size="{size}"/>' for size in sizes)
+    return f'<ssv:Parameter name="{name}"><ssv:{kind} value="{texts}"/>{dimensions}</ssv:Parameter>'
+
+
+def test_arrays_and_binaries_run(packages: Packages, capability_dir: Path) -> None:
+    """Whole arrays through a nested system, single elements, start values in rows, a binary."""
+    values = bindings(
+        binding(
+            array("matrix_in", "Float64", "1 2 3 4 5 6", 2, 3)
+            + '<ssv:Parameter name="binary_in"><ssv:Binary value="00FF10"/></ssv:Parameter>'
+            + array("vector_in", "Real", "7 8 9", 3)
+        )
+    )
+    outs = (
+        connector("matrix_out", "output", inner=MATRIX)
+        + connector("vector_out", "output", inner=SIZED)
+        + connector("binary_out", "output", inner='<ssc:Binary mime-type="image/png"/>')
+    )
+    ins = (
+        connector("matrix_in", "input", inner=MATRIX)
+        + connector("vector_in", "input", inner=VECTOR)
+        + connector("binary_in", "input", inner='<ssc:Binary mime-type="image/gif"/>')
+    )
+    passing_on = (
+        '<ssd:System name="s">'
+        + system(
+            array_component("b", ins),
+            connection("m", "b.matrix_in"),
+            f"<ssd:Connectors>{connector('m', 'input', inner=MATRIX)}</ssd:Connectors>",
+        )
+        + "</ssd:System>"
+    )
+    text = ssd(
+        system(
+            array_component("a", outs, values) + passing_on + array_component("c", ins),
+            connection("a.matrix_out", "s.m")
+            + connection("a.vector_out", "c.vector_in")
+            + connection("a.binary_out", "c.binary_in"),
+        ),
+        '<ssd:DefaultExperiment stopTime="0.5"/>',
+        version="2.0",
+    )
+    read = packages.read(text, all_types3__fmu=capability_dir / "all_types3.fmu")
+    assert set(pairs(read.system)) == {
+        ("a.matrix_out", "s.b.matrix_in"),
+        ("a.vector_out", "c.vector_in"),
+        ("a.binary_out", "c.binary_in"),
+    }
+    assert read.system.slaves["a"].parameters == {
+        "matrix_in": ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
+        "binary_in": "00ff10",
+        "vector_in": (7.0, 8.0, 9.0),
+    }
+    result = simulate(read.system, in_process=True, estimator="none", initial_step_size=0.25)
+    (note,) = read.notes
+    assert "of mime-type 'image/png' and 'image/gif'" in note
+    for i in (1, 2):
+        for j in (1, 2, 3):
+            first = result[f"a.matrix_out[{i},{j}]"][-1]
+            assert first == 2.0 * (3 * i - 3 + j)
+            assert result[f"s.b.matrix_out[{i},{j}]"][-1] == 2.0 * first
+    assert result["c.vector_out[2]"][-1] == (8.0 + 1.0) + 1.0
+    assert result["a.binary_out"][-1] == b"\x10\xff\x00"
+    assert result["c.binary_out"][-1] == b"\x00\xff\x10"
+
+
+def test_elements_of_arrays_are_connected(packages: Packages, capability_dir: Path) -> None:
+    """Two scalars fill the array of a system, which goes on as a whole; an element comes out."""
+    inside = (
+        '<ssd:System name="s">'
+        + system(
+            array_component("b", connector("vector_in", "input", inner=VECTOR)),
+            connection("v", "b.vector_in", linear(2, 1), SUPPRESSED),
+            f"<ssd:Connectors>{connector('v', 'input', inner=VECTOR)}</ssd:Connectors>"
+            + bindings(binding(array("v", "Real", "1 2 3", 3))),
+        )
+        + "</ssd:System>"
+    )
+    outs = connector("float64_out", "output") + connector("matrix_out", "output", inner=MATRIX)
+    ends = connection("a.float64_out", "s.v", attributes=f'endIndices="2" {SUPPRESSED}')
+    more = f'startIndices="2 3" endIndices="3" {SUPPRESSED}'
+    text = ssd(
+        system(
+            array_component("a", outs) + inside, ends + connection("a.matrix_out", "s.v", "", more)
+        ),
+        version="2.0",
+    )
+    read = packages.read(text, all_types3__fmu=capability_dir / "all_types3.fmu")
+    assert pairs(read.system) == [
+        ("a.float64_out", "s.b.vector_in[2]"),
+        ("a.matrix_out[2,3]", "s.b.vector_in[3]"),
+    ]
+    assert {(c.factor, c.offset) for c in read.system.connections} == {(2.0, 1.0)}
+    assert read.system.slaves["s.b"].parameters == {
+        "vector_in[1]": 3.0,
+        "vector_in[2]": 5.0,
+        "vector_in[3]": 7.0,
+    }
+    assert read.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "attributes", "told"),
+    [
+        (VECTOR, MATRIX, "", "different dimensions: 3 and 2 x 3"),
+        (VECTOR, '<ssc:Float64/><ssc:Dimension size="4"/>', "", "different dimensions: 3 and 4"),
+        (MATRIX, VECTOR, 'startIndices="1"', "1 indices for connector"),
+        (MATRIX, VECTOR, 'startIndices="1 1"', "different dimensions: one value and 3"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(
+    packages: Packages, source: str, target: str, attributes: str, told: str
+) -> None:
+    """With both dimensions and the line."""
+    parts = component("chassis", connector("x", "output", inner=source)) + component(
+        "wheel", connector("x_c", "input", inner=target)
+    )
+    text = ssd(system(parts, connection("chassis.x", "wheel.x_c", "", attributes)), version="2.0")
+    refused = packages.refusal(text)
+    assert told in refused
+    assert "SystemStructure.ssd, line " in refused
+
+
+def test_a_size_must_be_known_where_elements_are_connected(packages: Packages) -> None:
+    """Else nobody could say which elements the whole array stands for."""
+    parts = component(
+        "chassis",
+        connector("x", "output", inner=SIZED) + connector("v", "output", inner=VECTOR),
+    ) + component("wheel", connector("x_c", "input", inner=SIZED) + connector("v_c", "input"))
+    links = connection("chassis.x", "wheel.x_c")
+    links += connection("chassis.v", "wheel.v_c", attributes='startIndices="1"')
+    refused = packages.refusal(ssd(system(parts, links), version="2.0"))
+    assert "the size of connector 'x' of kind 'output' is not declared" in refused
+
+
+# ---- Signal dictionaries ------------------------------------------------------------------------
+
+
+def dictionary(entries: str, after: str = "") -> str:
+    """A signal dictionary."""
+    return f'<ssb:SignalDictionary version="1.0">{entries}{after}</ssb:SignalDictionary>'
+
+
+def signal(name: str, unit: str = "") -> str:
+    """An entry of a dictionary."""
+    attribute = f' unit="{unit}"' if unit else ""
+    return f'<ssb:DictionaryEntry name="{name}"><ssc:Real{attribute}/></ssb:DictionaryEntry>'
+
+
+def defined(inner: str) -> str:
+    """The dictionaries of a system."""
+    return (
+        '<ssd:SignalDictionaries><ssd:SignalDictionary name="bus" '
+        f"{inner}</ssd:SignalDictionary></ssd:SignalDictionaries>"
+    )
+
+
+def reference(name: str, *connectors: str, more: str = "") -> str:
+    """A reference to the dictionary."""
+    inner = f"<ssd:Connectors>{''.join(connectors)}</ssd:Connectors>{more}" if connectors else more
+    return (
+        f'<ssd:SignalDictionaryReference name="{name}" dictionary="bus">{inner}'
+        "</ssd:SignalDictionaryReference>"
+    )
+
+
+def bus_system(dictionaries: str) -> str:
+    """The quarter car, whose signals go over the entries of a dictionary of the root system."""
+    names = ("x", "v", "x_w", "v_w")
+    outer = reference("r", *(connector(name, "inout") for name in names))
+    inner = reference(
+        "r",
+        *(connector(name, "output") for name in names[:2]),
+        *(connector(name, "input") for name in names[2:]),
+    )
+    axle = (
+        '<ssd:System name="axle">'
+        + system(
+            WHOLE_WHEEL + inner,
+            connection("r.x", "wheel.x_c")
+            + connection("wheel.v_c", "r.v")
+            + connection("wheel.x", "r.x_w")
+            + connection("r.v_w", "wheel.v"),
+        )
+        + "</ssd:System>"
+    )
+    links = "".join(connection(f"chassis.{name}", f"r.{name}") for name in names)
+    return ssd(system(WHOLE_CHASSIS + outer + axle, links) + dictionaries)
+
+
+ENTRIES = "".join(signal(name) for name in ("x", "v", "x_w", "v_w"))
+
+
+def test_signals_of_a_dictionary_become_connections(packages: Packages) -> None:
+    """Shared by systems of several levels; inline, or in a file of its own."""
+    expected = {
+        (s.replace("wheel", "axle.wheel", 1), t.replace("wheel", "axle.wheel", 1))
+        for s, t in DIRECT
+    }
+    inline = packages.read(bus_system(defined(f">{dictionary(ENTRIES)}")))
+    file = dictionary(ENTRIES).replace(
+        "<ssb:SignalDictionary", f"<ssb:SignalDictionary{NAMESPACES}"
+    )
+    by_file = packages.read(bus_system(defined('source="resources/b.ssb">')), b__ssb=file)
+    for read in (inline, by_file):
+        assert set(pairs(read.system)) == expected
+        assert len(read.system.connections) == 4
+        assert read.notes == ()
+    schema = etree.XMLSchema(file=str(SCHEMAS / "SystemStructureSignalDictionary.xsd"))
+    schema.assertValid(etree.fromstring(file))
+
+
+def test_units_of_a_dictionary_are_converted(packages: Packages) -> None:
+    """From the component to the entry to another component, transformed on the way."""
+    units = UNITS.replace("ssd:", "ssb:")
+    parts = (
+        component("chassis", connector("x", "output", "m"))
+        + component("wheel", connector("x_c", "input", "m"))
+        + reference("r", connector("x", "inout"))
+    )
+    links = connection("chassis.x", "r.x", linear(2, 5)) + connection("r.x", "wheel.x_c")
+    text = ssd(system(parts, links) + defined(f">{dictionary(signal('x', 'mm'), units)}"))
+    (one,) = packages.read(text).system.connections
+    assert (one.factor, one.offset) == (pytest.approx(2.0), pytest.approx(0.005))
+
+
+def test_a_signal_that_nobody_gives_is_noted(packages: Packages) -> None:
+    """A value that is bound to the entry is the start value of what it leads to."""
+    parts = component("wheel", INPUTS) + reference("r", connector("x", "output"))
+    links = connection("r.x", "wheel.x_c")
+    more = defined(f">{dictionary(signal('x'))}")
+    read = packages.read(ssd(system(parts, links) + more))
+    assert "nothing drives entry 'x' of signal dictionary 'bus'" in read.notes[0]
+    given = parts.replace(
+        "</ssd:Connectors></ssd:SignalD",
+        f"</ssd:Connectors>{bindings(binding(real('x', 4)))}</ssd:SignalD",
+    )
+    read = packages.read(ssd(system(given, links) + more))
+    assert read.system.slaves["wheel"].parameters == {"x_c": 4.0}
+    assert read.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("parts", "links", "told"),
+    [
+        (reference("r", connector("y", "inout")), "", "'bus' has no entry 'y'"),
+        (
+            reference("r", connector("x", "inout")).replace('"bus"', '"buss"'),
+            "",
+            "no signal dictionary 'buss'; did you mean 'bus'?",
+        ),
+        (
+            reference("r", connector("x", "inout")) + CHASSIS,
+            connection("chassis.x", "r.x") + connection("chassis.v", "r.x"),
+            "entry 'x' of signal dictionary 'bus' has two sources",
+        ),
+        (
+            reference("r", connector("x", "inout")) + reference("q", connector("x", "inout")),
+            connection("r.x", "q.x"),
+            "a connection of kinds 'inout' and 'inout' has no direction",
+        ),
+    ],
+)
+def test_references_that_fit_nothing_are_refused(
+    packages: Packages, parts: str, links: str, told: str
+) -> None:
+    """With the line."""
+    refused = packages.refusal(ssd(system(parts, links) + defined(f">{dictionary(signal('x'))}")))
+    assert told in refused
+    assert "SystemStructure.ssd, line " in refused
+
+
 # ---- Parameters ---------------------------------------------------------------------------------
 
 
@@ -773,6 +1148,90 @@ def test_parameters_are_mapped_and_transformed(packages: Packages) -> None:
     assert read.system.slaves["wheel"].parameters == {"m": 0.04}
 
 
+def enumeration(name: str, item: str, type_: str = "gear") -> str:
+    """A parameter of an enumeration."""
+    return (
+        f'<ssv:Parameter name="{name}"><ssv:Enumeration value="{item}" name="{type_}"/>'
+        "</ssv:Parameter>"
+    )
+
+
+ENUMERATIONS = (
+    '<ssv:Enumerations><ssc:Enumeration name="gear"><ssc:Item name="low" value="1"/>'
+    '<ssc:Item name="high" value="2"/></ssc:Enumeration></ssv:Enumerations>'
+)
+
+
+def test_all_transformations_of_parameters(packages: Packages, capability_dir: Path) -> None:
+    """Each for its type; what has no entry stays as it is, and elements of arrays are mapped."""
+    values = (
+        '<ssv:Parameter name="flag"><ssv:Boolean value="true"/></ssv:Parameter>'
+        + array("counts", "Int16", "1 2 3", 3)
+        + enumeration("gear", "low")
+        + real("mass", 2)
+    )
+    mapping = (
+        entry("flag", "boolean_in", table("Boolean", true="false"))
+        + entry("counts", "vector_in", table("Integer", _1=7))
+        + entry("gear", "enumeration_in", table("Enumeration", low="high", high="low"))
+        + entry("gear", "int8_in", table("Integer", _1=5))
+        + entry("gear", "uint8_in")
+        + entry("mass", "float64_in", linear(3, 1))
+    )
+    text = binding(values, mapping, after=ENUMERATIONS)
+    read = packages.read(
+        ssd(system(array_component("a", connector("float64_in", "input"), bindings(text)))),
+        all_types3__fmu=capability_dir / "all_types3.fmu",
+    )
+    assert read.system.slaves["a"].parameters == {
+        "boolean_in": False,
+        "vector_in": (7, 2, 3),
+        "enumeration_in": 2,
+        "int8_in": 5,
+        "uint8_in": 1,
+        "float64_in": 7.0,
+    }
+    assert read.notes == ()
+
+
+def test_items_get_the_numbers_of_the_connector(packages: Packages, capability_dir: Path) -> None:
+    """Where the component says which enumeration its variable has, that counts."""
+    text = binding(enumeration("enumeration_in", "high"), after=ENUMERATIONS)
+    text = ssd(
+        system(
+            array_component("a", connector("enumeration_in", "input", inner=MODE), bindings(text))
+        ),
+        '<ssd:Enumerations><ssc:Enumeration name="mode"><ssc:Item name="high" value="3"/>'
+        "</ssc:Enumeration></ssd:Enumerations>",
+    )
+    fmu = {"all_types3__fmu": capability_dir / "all_types3.fmu"}
+    read = packages.read(text, **fmu)
+    assert read.system.slaves["a"].parameters == {"enumeration_in": 3}
+    refused = packages.refusal(text.replace('value="high"', 'value="odd"'), **fmu)
+    assert "Enumeration item 'odd' has no number" in refused
+
+
+def test_units_of_parameters_are_converted(packages: Packages) -> None:
+    """To the unit of the variable, before a linear transformation, unless that is suppressed."""
+    units = (
+        '<ssv:Units><ssc:Unit name="g"><ssc:BaseUnit kg="1" factor="0.001"/></ssc:Unit>'
+        '<ssc:Unit name="m"><ssc:BaseUnit m="1"/></ssc:Unit></ssv:Units>'
+    )
+
+    def mass(mapping: str) -> Any:
+        text = binding(real("mass", 500, "g"), mapping, after=units)
+        read = packages.read(ssd(system(component("wheel", INPUTS, bindings(text)))))
+        assert read.notes == ()
+        return read.system.slaves["wheel"].parameters["m"]
+
+    assert mass(entry("mass", "m")) == pytest.approx(0.5)
+    assert mass(entry("mass", "m", linear(2, 1))) == pytest.approx(2.0)
+    suppressed = entry("mass", "m", linear(2, 1)).replace(" target", f" {SUPPRESSED} target")
+    assert mass(suppressed) == 1001.0
+    with pytest.raises(ConfigurationError, match="unit 'g' cannot be converted to 'm'"):
+        mass(entry("mass", "x"))
+
+
 def test_parameters_pass_connectors_with_their_transformations(packages: Packages) -> None:
     """A value for a connector reaches every variable behind it, converted and transformed."""
     inside = (
@@ -819,10 +1278,7 @@ def test_what_does_not_fit_is_noted(packages: Packages) -> None:
         )
     )
     assert read.system.slaves["wheel"].parameters == {"m": 40000.0}
-    assert (
-        "the value for wheel.m has the unit 'g', which is not converted to its unit 'kg'"
-        in read.notes[0]
-    )
+    assert "wheel.m has the unit 'g', which is not converted to its unit 'kg'" in read.notes[0]
     assert "no variable of 'wheel' has the name 'mass'; not applied" in read.notes[1]
     assert "inputs of the whole system 'u': nothing drives them" in read.notes[2]
     assert read.system.connections == ()
@@ -985,7 +1441,7 @@ ENUMERATED = (
         ),
         (
             connection("chassis.x", "wheel.x_c", MAPPED.replace("ssc:MapEntry", "ssc:Strange")),
-            "ssc:Strange: is not supported in ssc:BooleanMappingTransformation",
+            "ssc:BooleanMappingTransformation: has no ssc:MapEntry",
         ),
         (connection("chassis.x", "chassis.v"), "has no direction"),
         (connection("chassis.x", "whel.x_c"), "no element 'whel'; did you mean 'wheel'?"),

@@ -164,6 +164,7 @@ class ParameterBinder:
             return
         for name, value in _elements(connector.name, (), parameter.value):
             element = (port[0], name)
+            self.given.add(element)
             self._follow(element, replace(parameter, value=value), {element})
 
     def _follow(self, port: Port, parameter: Parameter, passed: set[Port]) -> None:
