@@ -5,12 +5,14 @@ from __future__ import annotations
 import stat
 import tomllib
 import zipfile
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 import fmpy.ssp.ssd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from lxml import etree
 from typer.testing import CliRunner
@@ -18,8 +20,10 @@ from typer.testing import CliRunner
 from master_node import System, load_system, open_system, simulate
 from master_node.cli import app
 from master_node.ssp.structure import Linear, Table, Unit
+from master_node.ssp.writing import write_package
 from master_node.system_files import ImportedSystem, export_system, import_system, read_ssp
 from protocol.errors import ConfigurationError, ModelError
+from protocol.slave import SlaveDescription
 from tests.quarter_car_case import EXAMPLES
 
 pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
@@ -342,6 +346,224 @@ def test_export_and_import_lose_nothing(full: Path, packages: Packages) -> None:
     for name in ("wheel", "chassis"):
         copied = packages.folder / "again_models" / f"{name}.fmu"
         assert copied.read_bytes() == (full.parent / f"{name}.fmu").read_bytes()
+
+
+TYPED = """
+[slaves.a]
+model = "all_types3.fmu"
+
+[slaves.a.parameters]
+n = 4
+boolean_in = true
+int64_in = -5000000000
+uint64_in = 18446744073709551615
+binary_in = "00ff"
+string_in = "a & b"
+enumeration_in = 2
+matrix_in = [[1.0, 2.5, 3.0], [4.0, 5.0, 6.0]]
+"vector_in[4]" = 1e300
+
+[slaves.b]
+model = "all_types3.fmu"
+
+[[connections]]
+from = "a.vector_out"
+to = "b.vector_in"
+factor = 2.0
+
+[[connections]]
+from = "a.matrix_out[1,2]"
+to = "b.float64_in"
+
+[[connections]]
+from = "a.boolean_out"
+to = "b.boolean_in"
+mapping = { true = false, false = true }
+
+[[connections]]
+from = "a.int8_out"
+to = "b.int32_in"
+mapping = { -1 = 7, 3 = 0 }
+
+[inputs]
+"a.float64_in" = 2.5
+
+[results]
+variables = ["a.*", "!a.vector_out*"]
+every = 2
+formats = ["csv", "arrow"]
+"""
+
+
+@pytest.fixture
+def typed(tmp_path: Path, capability_dir: Path) -> Path:
+    """A system file with values of all types, arrays and mappings."""
+    (tmp_path / "all_types3.fmu").write_bytes((capability_dir / "all_types3.fmu").read_bytes())
+    path = tmp_path / "typed.toml"
+    path.write_text(TYPED, encoding="utf-8")
+    return path
+
+
+def test_all_types_come_back(typed: Path, packages: Packages) -> None:
+    """By a package and by a system file made of it; SSP 2.0 is written for what 1.0 has not."""
+    given = with_whole_transformations(tables(load_system(typed)))
+    given["simulation"]["start_time"] = 0.0
+    package = typed.with_name("typed.ssp")
+    export_system(typed, package)
+    read = packages.read_file(package)
+    assert read.notes == ()
+    assert tables(read.system) == given
+    import_system(package, typed.with_name("again.toml"))
+    assert tables(load_system(typed.with_name("again.toml"))) == given
+    with zipfile.ZipFile(package) as archive:
+        roots = {n: etree.fromstring(archive.read(n)) for n in archive.namelist()[:2]}
+    assert {root.get("version") for root in roots.values()} == {"2.0"}
+    assert b"AAD/" not in etree.tostring(roots["resources/a.ssv"])
+    binary = roots["resources/a.ssv"].find(".//{*}Binary")
+    assert binary is not None
+    assert binary.get("value") == "00ff"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('[inputs]\n"a.float64_in" = { table = "road.csv" }', "cannot be put into a package"),
+        (
+            '[inputs]\n"a.float64_in" = { function = "m.py:f" }',
+            "a table or a function cannot be put into a package; export the system without it",
+        ),
+        (
+            "[slaves.a.parameters]\nmatrix_in = [[1.0], [1.0, 2.0]]",
+            "its rows have different sizes",
+        ),
+        ("[slaves.a.parameters]\nvector_in = [1.0, true]", "an array of Boolean and Real"),
+        ("[slaves.a.parameters]\nint64_in = 18446744073709551616", "has more than 64 bits"),
+        ('[slaves.a.parameters]\n"vector_inn[1]" = 1.0', "did you mean 'vector_in[1]'"),
+    ],
+)
+def test_what_ssp_cannot_hold_is_named(typed: Path, text: str, told: str) -> None:
+    """With file and table, and no package is left behind."""
+    typed.write_text(f'[slaves.a]\nmodel = "all_types3.fmu"\n{text}\n', encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"typed\.toml: \[") as caught:
+        export_system(typed, typed.with_name("typed.ssp"))
+    assert told in str(caught.value)
+    assert not typed.with_name("typed.ssp").exists()
+
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+NAMES = st.sampled_from(["a", "b", "left.wheel", "x-1", "A_b"])
+INTEGERS = st.integers(-(2**31), 2**31 - 1)
+MAPPINGS = st.none() | st.dictionaries(INTEGERS, INTEGERS, min_size=1, max_size=3)
+TEXTS = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=9)
+VALUES = st.fixed_dictionaries(
+    {},
+    optional={
+        "float64_in": FINITE,
+        "float32_in": FINITE,
+        "int64_in": st.integers(-(2**63), 2**63 - 1),
+        "uint64_in": st.integers(0, 2**64 - 1),
+        "int8_in": st.integers(-128, 127),
+        "boolean_in": st.booleans(),
+        "string_in": TEXTS,
+        "binary_in": st.binary(max_size=9).map(bytes.hex),
+        "enumeration_in": st.integers(1, 3),
+        "vector_in": st.tuples(FINITE, FINITE, FINITE),
+        "matrix_in": st.tuples(*[st.tuples(FINITE, FINITE, FINITE)] * 2),
+        "n": st.integers(1, 9),
+    },
+)
+LINEAR = st.fixed_dictionaries({"factor": FINITE, "offset": FINITE})
+UNITS_AS_THEY_ARE = st.fixed_dictionaries({"ignore_units": st.booleans()})
+WAYS = {
+    "float64": LINEAR | UNITS_AS_THEY_ARE,
+    "vector": LINEAR | UNITS_AS_THEY_ARE,
+    "matrix": LINEAR | UNITS_AS_THEY_ARE,
+    "matrix[2,3]": LINEAR | UNITS_AS_THEY_ARE,
+    "int32": st.fixed_dictionaries({"mapping": MAPPINGS}),
+    "enumeration": st.fixed_dictionaries({"mapping": MAPPINGS}),
+    "boolean": st.fixed_dictionaries(
+        {"mapping": st.none() | st.dictionaries(st.booleans(), st.booleans(), min_size=1)}
+    ),
+    "string": st.just({}),
+    "binary": st.just({}),
+}
+SETTINGS = st.fixed_dictionaries(
+    {"start_time": st.floats(-1e3, 1e3)},
+    optional={
+        "stop_time": st.floats(2e3, 1e9),
+        "order": st.sampled_from([0, 1, 2, 3, "auto"]),
+        "estimator": st.sampled_from(["rich", "mod"]),
+        "relative_tolerance": st.floats(1e-12, 1.0),
+        "events": st.lists(st.floats(1.1e3, 1.9e3), max_size=2).map(tuple),
+    },
+)
+
+
+def variable(name: str, causality: str) -> str:
+    """A variable of the FMU of all types: ``matrix_out[2,3]`` of ``matrix[2,3]``."""
+    name, bracket, indices = name.partition("[")
+    return f"{name}_{causality}{bracket}{indices}"
+
+
+@st.composite
+def systems(draw: st.DrawFn) -> dict[str, Any]:
+    """Tables of a system of FMUs of all types."""
+    slaves = draw(st.lists(NAMES, min_size=1, max_size=3, unique=True))
+    connections = []
+    for target in slaves:
+        for way in draw(st.lists(st.sampled_from(list(WAYS)), max_size=3, unique=True)):
+            source = draw(st.sampled_from(slaves))
+            ends = {
+                "from": f"{source}.{variable(way, 'out')}",
+                "to": f"{target}.{variable(way, 'in')}",
+            }
+            connections.append(ends | draw(WAYS[way]))
+    return {
+        "simulation": draw(SETTINGS),
+        "slaves": {
+            name: {"model": "all_types3.fmu", "parameters": draw(VALUES)} for name in slaves
+        },
+        "connections": connections,
+        "inputs": draw(st.dictionaries(st.just(f"{slaves[0]}.float32_in"), FINITE)),
+        "results": draw(st.sampled_from([{}, {"every": 3}, {"formats": ("arrow",)}])),
+        "bus": draw(st.sampled_from([{}, {"step_timeout": 5.0, "pin": True}])),
+    }
+
+
+@given(given_tables=systems())
+@settings(max_examples=40)
+def test_what_is_exported_is_imported_as_it_was(
+    tmp_path_factory: pytest.TempPathFactory, capability_dir: Path, given_tables: dict[str, Any]
+) -> None:
+    """Any system of FMUs: all settings, values, connections and transformations come back.
+
+    The description of the FMU is read once, and the FMU itself is not packed: what an archive does
+    to it other tests show.
+    """
+    folder = tmp_path_factory.mktemp("law")
+    system = System(**given_tables, base=folder, source="law.toml")
+    model = capability_dir / "all_types3.fmu"
+    (folder / "all_types3.fmu").symlink_to(model)
+    write_package(
+        system,
+        dict.fromkeys(system.slaves, "all_types3.fmu"),
+        lambda *_: described(model),
+        "law",
+        folder / "law.ssp",
+    )
+    (folder / "scratch").mkdir()
+    read = read_ssp(folder / "law.ssp", folder / "scratch")
+    assert tables(read.system) == with_whole_transformations(tables(system))
+    assert read.notes == ()
+
+
+@cache
+def described(model: Path) -> SlaveDescription:
+    """What a model says of itself."""
+    description: SlaveDescription = entry_points(group="doublestep.in_process")["describe"].load()(
+        str(model), Path()
+    )
+    return description
 
 
 def test_equal_systems_give_equal_packages(full: Path, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ from master_node.ssp.structure import (
     listed,
 )
 from master_node.ssp.transformations import apply
+from master_node.start_values import structural_parameters
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.slave import SlaveDescription, Variable, VariableType
 
@@ -121,9 +122,7 @@ class ParameterBinder:
             description = self._describe(component.model)
         except DoublestepError as error:
             raise error.located(slave=slave) from None
-        variables = {variable.name: variable for variable in description.variables}
-        array = [v for n, v in variables.items() if n.startswith(f"{name}[")]
-        variable = variables.get(name) or next(iter(array), None)
+        variable, is_array = _variable(description, name)
         if variable is None:
             return False
         defined = description.units.get(variable.unit)
@@ -137,7 +136,7 @@ class ParameterBinder:
             connector.items if connector is not None else {},
         )
         parameter = _numbered(self._arrived(parameter, target), parameter.items)
-        value = _checked(parameter, variable, target.shown, is_array=name not in variables)
+        value = _checked(parameter, variable, target.shown, is_array=is_array)
         if _depth(value) <= _MOST_DIMENSIONS:
             self.parameters[path][name] = value
         else:
@@ -272,6 +271,20 @@ def _checked(parameter: Parameter, variable: Variable, shown: str, *, is_array: 
             remedy="give the parameter a Dimension for each one of the variable",
         )
     return parameter.value
+
+
+def _variable(description: SlaveDescription, name: str) -> tuple[Variable | None, bool]:
+    """The variable of that name, or the first element of that array, and whether it is one.
+
+    Structural parameters may give an array more elements than the description has.
+    """
+    variables = {variable.name: variable for variable in description.variables}
+    if name in variables:
+        return variables[name], False
+    array, bracket, _ = name.rpartition("[")
+    is_element = bool(bracket and structural_parameters(description))
+    prefix = f"{array if is_element else name}["
+    return next((v for n, v in variables.items() if n.startswith(prefix)), None), not is_element
 
 
 def _depth(value: Value) -> int:

@@ -61,6 +61,7 @@ def write_package(
         ConfigurationError: something cannot be said in SSP, with slave or connection.
         OSError: the package cannot be written, or a model cannot be read.
     """
+    _check_inputs(system)
     descriptions = {}
     for slave, settings in system.slaves.items():
         try:
@@ -72,7 +73,6 @@ def write_package(
         for slave, settings in system.slaves.items()
         if settings.parameters
     }
-    _check_inputs(system)
     with zipfile.ZipFile(path, "w") as archive:
         for document, xml in documents.items():
             archive.writestr(_entry(document, zipfile.ZIP_DEFLATED), xml)
