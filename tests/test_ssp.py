@@ -660,6 +660,8 @@ def test_a_package_cannot_open_the_bus_to_others(full: Path, packages: Packages)
         ("[slaves.other]\nstep_size = 0.1", "settings of 'other', no slave"),
         ("[simulation]\nordr = 1", "unknown key 'ordr'; did you mean 'order'"),
         ("x = 1", "holds more than"),
+        ('[inputs]\n"wheel.x_c" = { function = "os:system" }', "more than a number"),
+        ('[inputs]\n"wheel.x_c" = { table = "/etc/passwd" }', "more than a number"),
         ("[", "is not TOML"),
     ],
 )
@@ -1759,7 +1761,9 @@ def test_what_has_no_influence_is_noted_in_one_sentence(packages: Packages) -> N
         '<ssd:Annotations><ssc:Annotation type="com.example"><x xmlns="urn:x"/></ssc:Annotation>'
         "</ssd:Annotations>"
     )
-    path = packages.write(ssd(system(wheel), annotations))
+    variant = '<ssd:SSDVariant name="a" baseSSD="SystemStructure.ssd" kind="parameterVariant"/>'
+    signed = '<ssc:MetaData kind="general" type="text/plain"/><ssc:Signature role="authenticity"/>'
+    path = packages.write(ssd(system(wheel), signed + annotations + variant, version="2.0"))
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("extra/com.example/a.txt", "a")
         archive.writestr("Variant.ssd", "")
@@ -1768,7 +1772,7 @@ def test_what_has_no_influence_is_noted_in_one_sentence(packages: Packages) -> N
     *notes, last = read.notes
     assert last.endswith(
         "not carried, as it has no influence here: annotation com.example, "
-        "ssd:ConnectorGeometry (2 times), description"
+        "ssd:ConnectorGeometry (2 times), description, ssc:MetaData, ssc:Signature, ssd:SSDVariant"
     )
     assert any("attribute 'strange' is not carried" in note for note in notes)
     assert any("'extra/com.example/a.txt' is not carried" in note for note in notes)
@@ -1833,6 +1837,69 @@ def test_document_types_are_refused(packages: Packages) -> None:
     by_file = bindings('<ssd:ParameterBinding source="resources/a.ssv"/>')
     text = ssd(system(component("wheel", INPUTS, by_file)))
     assert "a.ssv declares a document type" in packages.refusal(text, a__ssv=f"{BOMB}<x/>")
+    mapped = by_file.replace("/>", '><ssd:ParameterMapping source="resources/a.ssm"/>', 1)
+    mapped = mapped.replace(
+        "</ssd:ParameterBindings>", "</ssd:ParameterBinding></ssd:ParameterBindings>"
+    )
+    values = parameter_set("").replace("<ssv:ParameterSet", f"<ssv:ParameterSet{NAMESPACES}")
+    text = ssd(system(component("wheel", INPUTS, mapped)))
+    refused = packages.refusal(text, a__ssv=values, a__ssm=f"{BOMB}<x/>")
+    assert "a.ssm declares a document type" in refused
+    text = ssd(system(WHEEL) + defined('source="resources/a.ssb">'))
+    assert "a.ssb declares a document type" in packages.refusal(text, a__ssb=f"{BOMB}<x/>")
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("http://example.org/a", "is not a relative URI"),
+        ("file:///etc/passwd", "is not a relative URI"),
+        ("//example.org/a", "is not a relative URI"),
+        ("/etc/passwd", "leads outside the folder"),
+        ("resources/../../a", "leads outside the folder"),
+        ("resources/%2e%2e/%2e%2e/a", "leads outside the folder"),
+        ("resources\\..\\..\\a", "leads outside the folder"),
+        ("C%3A/a", "leads outside the folder"),
+    ],
+)
+@pytest.mark.parametrize(
+    "place", ["component", "package", "description", "values", "mapping", "dictionary"]
+)
+def test_sources_that_lead_elsewhere_are_refused(
+    packages: Packages, place: str, source: str, told: str
+) -> None:
+    """Wherever a document may name a file: nothing is fetched, nothing read beside the package."""
+    named = f'source="{source}"'
+    kinds = {"package": "application/x-ssp-package", "description": "application/x-ssp-definition"}
+    before = after = ""
+    if place == "values":
+        before = bindings(f"<ssd:ParameterBinding {named}/>")
+    elif place == "mapping":
+        text = binding("", entry("a", "b"))
+        start, end = text.index("<ssd:ParameterMapping>"), text.index("</ssd:ParameterBinding>")
+        before = bindings(f"{text[:start]}<ssd:ParameterMapping {named}/>{text[end:]}")
+    elif place == "dictionary":
+        after = defined(f"{named}>")
+    type_ = f'type="{kinds[place]}" ' if place in kinds else ""
+    own = f"{type_}{named}" if place in ("component", *kinds) else ""
+    text = ssd(system(component("wheel", INPUTS, source=own), before=before) + after)
+    assert told in packages.refusal(text)
+
+
+def test_arrays_without_end_are_refused(
+    packages: Packages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few lines could stand for more connections than there is memory."""
+    monkeypatch.setattr("master_node.ssp.graph.MAX_EDGES", 100)
+    large = '<ssc:Float64/><ssc:Dimension size="100000"/>'
+    parts = component("chassis", connector("x", "output", inner=large) + connector("v", "output"))
+    parts += component("wheel", connector("x_c", "input", inner=large))
+    links = connection("chassis.v", "wheel.x_c", attributes='endIndices="1"')
+    inside = (
+        f'<ssd:System name="s">{system(parts, connection("chassis.x", "wheel.x_c"))}</ssd:System>'
+    )
+    refused = packages.refusal(ssd(system(parts + inside, links), version="2.0"))
+    assert "more than 100 connections" in refused
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 but not more", b"<x/>"])

@@ -28,6 +28,7 @@ from protocol.names import nearest
 Path = tuple[str, ...]
 Port = tuple[Path, str]
 INWARD = frozenset({"input", "parameter", "structuralParameter"})
+MAX_EDGES = 1_000_000
 OPEN = frozenset({"inout", "unspecified"})
 """Kinds whose direction is that of what they are connected to."""
 
@@ -97,6 +98,12 @@ class SignalGraph:
             for element in system.connections:
                 for edge in self._edges(path, system, element):
                     self._add(edge)
+                if len(self.incoming) > MAX_EDGES:
+                    raise ConfigurationError(
+                        f"{element.place}: more than {MAX_EDGES} connections, counting each "
+                        "element of an array",
+                        remedy="connect whole arrays, or remove connections of single elements",
+                    )
 
     def way_to(self, edge: Edge) -> list[Edge]:
         """All connections from where a signal comes from to ``edge``, the first one first.
