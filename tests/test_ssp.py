@@ -593,8 +593,12 @@ def test_exported_documents_keep_the_schemas(full: Path, tmp_path: Path) -> None
 def test_the_documents_of_the_tests_keep_the_schemas_too() -> None:
     """So what is read here is what other tools write."""
     schema = etree.XMLSchema(file=str(SCHEMAS / "SystemStructureDescription.xsd"))
-    for text in (NESTED, (EXAMPLES.parent / "ssp" / "SystemStructure.ssd").read_text("utf-8")):
+    example = EXAMPLES.parent / "ssp"
+    for text in (NESTED, (example / "SystemStructure.ssd").read_text("utf-8")):
         schema.assertValid(etree.fromstring(text.encode()))
+    for file, kind in (("road.ssv", "ParameterValues"), ("road.ssm", "ParameterMapping")):
+        schema = etree.XMLSchema(file=str(SCHEMAS / f"SystemStructure{kind}.xsd"))
+        schema.assertValid(etree.parse(example / "resources" / file))
 
 
 def test_what_is_no_fmu_cannot_be_exported(full: Path, tmp_path: Path) -> None:

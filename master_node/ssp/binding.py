@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 from master_node.ssp.graph import INWARD, Edge, Port, SignalGraph, numbered
@@ -58,6 +59,31 @@ class _Target:
     items: Mapping[str, int]
 
 
+class _Model:
+    """The variables of an FMU by their names."""
+
+    def __init__(self, description: SlaveDescription) -> None:
+        self.units = description.units
+        self._variables = {variable.name: variable for variable in description.variables}
+        self._arrays = {
+            variable.name.rpartition("[")[0]: variable
+            for variable in reversed(description.variables)
+            if variable.name.endswith("]")
+        }
+        self._is_sized = bool(structural_parameters(description))
+
+    def find(self, name: str) -> tuple[Variable | None, bool]:
+        """The variable of that name, or the first element of that array, and whether it is one.
+
+        Structural parameters may give an array more elements than the description has.
+        """
+        if name in self._variables:
+            return self._variables[name], False
+        if self._is_sized and name.endswith("]"):
+            return self._arrays.get(name.rpartition("[")[0]), False
+        return self._arrays.get(name), True
+
+
 class ParameterBinder:
     """Gives bound values to the variables of components.
 
@@ -81,7 +107,7 @@ class ParameterBinder:
     ) -> None:
         self._graph = graph
         self._names = names
-        self._describe = describe
+        self._model = cache(lambda fmu: _Model(describe(fmu)))
         self._notes = notes
         self.parameters: dict[ElementPath, dict[str, Value]] = {p: {} for p in graph.components}
         self.given: set[Port] = set()
@@ -119,13 +145,13 @@ class ParameterBinder:
     def _give_component(self, path: ElementPath, parameter: Parameter) -> bool:
         component, slave, name = self._graph.components[path], self._names[path], parameter.name
         try:
-            description = self._describe(component.model)
+            model = self._model(component.model)
         except DoublestepError as error:
             raise error.located(slave=slave) from None
-        variable, is_array = _variable(description, name)
+        variable, is_array = model.find(name)
         if variable is None:
             return False
-        defined = description.units.get(variable.unit)
+        defined = model.units.get(variable.unit)
         connector = component.connectors.get(name)
         target = _Target(
             f"{slave}.{name}",
@@ -137,10 +163,12 @@ class ParameterBinder:
         )
         parameter = _numbered(self._arrived(parameter, target), parameter.items)
         value = _checked(parameter, variable, target.shown, is_array=is_array)
-        if _depth(value) <= _MOST_DIMENSIONS:
-            self.parameters[path][name] = value
-        else:
-            self.parameters[path].update(_elements(name, (), value))
+        whole = _depth(value) <= _MOST_DIMENSIONS
+        given = {name: value} if whole else dict(_elements(name, (), value))
+        parameters = self.parameters[path]
+        for key in given.keys() & parameters.keys():
+            del parameters[key]  # of an array and its elements what comes later wins
+        parameters.update(given)
         return True
 
     def _give_connector(
@@ -271,20 +299,6 @@ def _checked(parameter: Parameter, variable: Variable, shown: str, *, is_array: 
             remedy="give the parameter a Dimension for each one of the variable",
         )
     return parameter.value
-
-
-def _variable(description: SlaveDescription, name: str) -> tuple[Variable | None, bool]:
-    """The variable of that name, or the first element of that array, and whether it is one.
-
-    Structural parameters may give an array more elements than the description has.
-    """
-    variables = {variable.name: variable for variable in description.variables}
-    if name in variables:
-        return variables[name], False
-    array, bracket, _ = name.rpartition("[")
-    is_element = bool(bracket and structural_parameters(description))
-    prefix = f"{array if is_element else name}["
-    return next((v for n, v in variables.items() if n.startswith(prefix)), None), not is_element
 
 
 def _depth(value: Value) -> int:
