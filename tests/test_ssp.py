@@ -1147,6 +1147,40 @@ def test_arrays_that_do_not_fit_are_refused(
     assert "SystemStructure.ssd, line " in refused
 
 
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (real("v", 1), "a value of dimensions one value for connector 's.v' of dimensions 3"),
+        (array("v", "Real", "1 2", 2), "a value of dimensions 2 for connector 's.v'"),
+    ],
+)
+@pytest.mark.parametrize("attributes", ["", 'startIndices="1"'])
+def test_values_of_another_size_are_refused(
+    packages: Packages, values: str, told: str, attributes: str
+) -> None:
+    """Both where arrays are connected as a whole and element by element."""
+    inner = connector("x_c", "input", inner="" if attributes else VECTOR)
+    inside = (
+        '<ssd:System name="s">'
+        + system(
+            component("wheel", inner),
+            connection("v", "wheel.x_c", "", attributes),
+            f"<ssd:Connectors>{connector('v', 'input', inner=VECTOR)}</ssd:Connectors>"
+            + bindings(binding(values)),
+        )
+        + "</ssd:System>"
+    )
+    assert told in packages.refusal(ssd(system(inside), version="2.0"))
+
+
+def test_a_value_that_leads_nowhere_is_noted(packages: Packages) -> None:
+    """A connector may be declared and not connected."""
+    whole = f"<ssd:Connectors>{connector('u', 'input')}</ssd:Connectors>"
+    read = packages.read(ssd(system(WHEEL, before=whole + bindings(binding(real("u", 1))))))
+    (note,) = read.notes
+    assert "connector 'u' leads to nothing that could take its value; not applied" in note
+
+
 def test_a_size_must_be_known_where_elements_are_connected(packages: Packages) -> None:
     """Else nobody could say which elements the whole array stands for."""
     parts = component(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-from master_node.ssp.graph import INWARD, Edge, Port, SignalGraph, numbered
+from master_node.ssp.graph import INWARD, Edge, Port, SignalGraph, numbered, shape
 from master_node.ssp.graph import Path as ElementPath
 from master_node.ssp.structure import (
     Component,
@@ -163,7 +163,7 @@ class ParameterBinder:
         )
         parameter = _numbered(self._arrived(parameter, target), parameter.items)
         value = _checked(parameter, variable, target.shown, is_array=is_array)
-        whole = _depth(value) <= _MOST_DIMENSIONS
+        whole = len(_sizes(value)) <= _MOST_DIMENSIONS
         given = {name: value} if whole else dict(_elements(name, (), value))
         parameters = self.parameters[path]
         for key in given.keys() & parameters.keys():
@@ -184,15 +184,31 @@ class ParameterBinder:
                 f"{connector.kind!r}, is not supported",
                 remedy="give it to the component that the connector belongs to",
             )
-        self.given.add(port)
+        sizes = _sizes(parameter.value)
+        if len(sizes) != len(connector.dimensions) or any(
+            declared not in (None, size)
+            for declared, size in zip(connector.dimensions, sizes, strict=True)
+        ):
+            raise ConfigurationError(
+                f"{parameter.place}: a value of dimensions {shape(sizes)} for "
+                f"{self._graph.shown(port)} of dimensions {shape(connector.dimensions)}",
+                remedy="give the parameter a Dimension for each one of the connector",
+            )
         parameter = self._arrived(parameter, _at(connector))
-        if not self._graph.is_by_elements:
-            self._follow(port, parameter, {port})
-            return
-        for name, value in _elements(connector.name, (), parameter.value):
-            element = (port[0], name)
-            self.given.add(element)
-            self._follow(element, replace(parameter, value=value), {element})
+        parts = {port: parameter}
+        if self._graph.is_by_elements:
+            parts = {
+                (port[0], name): replace(parameter, value=value)
+                for name, value in _elements(connector.name, (), parameter.value)
+            }
+        if self._graph.outgoing.keys().isdisjoint(parts):
+            self._notes.tell(
+                f"{parameter.place}: {self._graph.shown(port)} leads to nothing that could take "
+                "its value; not applied"
+            )
+        self.given.update((port, *parts))
+        for start, part in parts.items():
+            self._follow(start, part, {start})
 
     def _follow(self, port: Port, parameter: Parameter, passed: set[Port]) -> None:
         for edge in self._graph.outgoing.get(port, ()):
@@ -301,8 +317,8 @@ def _checked(parameter: Parameter, variable: Variable, shown: str, *, is_array: 
     return parameter.value
 
 
-def _depth(value: Value) -> int:
-    return 1 + _depth(value[0]) if isinstance(value, tuple) else 0
+def _sizes(value: Value) -> tuple[int, ...]:
+    return (len(value), *_sizes(value[0])) if isinstance(value, tuple) else ()
 
 
 def _elements(name: str, indices: tuple[int, ...], value: Value) -> Iterator[tuple[str, Scalar]]:

@@ -122,8 +122,10 @@ class SignalGraph:
 
     def connector(self, path: Path, name: str) -> Connector | None:
         """The connector of a system, a component or a reference; None: it has none."""
-        owner = self.components.get(path) or self.references.get(path) or self.systems[path]
-        return owner.connectors.get(name)
+        if path not in self.references:
+            return (self.components.get(path) or self.systems[path]).connectors.get(name)
+        connector = self.references[path].connectors.get(name)
+        return connector and _as_entry(connector, self._dictionaries[path][1].entries[name])
 
     def entry(self, path: Path, name: str) -> Port:
         """The port of the entry that a connector of a reference stands for."""
@@ -249,7 +251,7 @@ class SignalGraph:
         ):
             raise ConfigurationError(
                 f"{place}: {source.shown} and {target.shown} have different dimensions: "
-                f"{_shape(shapes[0])} and {_shape(shapes[1])}",
+                f"{shape(shapes[0])} and {shape(shapes[1])}",
                 remedy="connect arrays of one size, or elements by startIndices and endIndices",
             )
         if not self.is_by_elements:
@@ -302,7 +304,8 @@ def _as_entry(connector: Connector, entry: Connector) -> Connector:
     )
 
 
-def _shape(dimensions: tuple[int | None, ...]) -> str:
+def shape(dimensions: tuple[int | None, ...]) -> str:
+    """Dimensions for a message."""
     return " x ".join("?" if size is None else str(size) for size in dimensions) or "one value"
 
 
