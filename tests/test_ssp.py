@@ -5,9 +5,11 @@ from __future__ import annotations
 import stat
 import tomllib
 import zipfile
+from copy import deepcopy
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import fmpy.ssp.ssd
@@ -19,7 +21,9 @@ from typer.testing import CliRunner
 
 from master_node import System, load_system, open_system, simulate
 from master_node.cli import app
-from master_node.ssp.structure import Linear, Table, Unit
+from master_node.ssp.flattening import flatten
+from master_node.ssp.reading import read_structure
+from master_node.ssp.structure import Linear, Notes, Table, Unit
 from master_node.ssp.writing import write_package
 from master_node.system_files import ImportedSystem, export_system, import_system, read_ssp
 from protocol.errors import ConfigurationError, ModelError
@@ -1938,6 +1942,91 @@ def test_arrays_without_end_are_refused(
     )
     refused = packages.refusal(ssd(system(parts + inside, links), version="2.0"))
     assert "more than 100 connections" in refused
+
+
+def every_element() -> list[str]:
+    """Descriptions that use all that can be read."""
+    values = binding(
+        enumeration("gear", "low") + array("counts", "Int16", "1 2 3", 3) + real("mass", 2, "mm"),
+        entry("counts", "vector_in", table("Integer", _1=7))
+        + entry("gear", "enumeration_in", table("Enumeration", low="high"))
+        + entry("mass", "float64_in", linear(3, 1)),
+        after=ENUMERATIONS + UNITS.replace("ssd:", "ssv:"),
+    )
+    outs = connector("float64_out", "output") + connector("matrix_out", "output", inner=MATRIX)
+    inside = (
+        '<ssd:System name="s">'
+        + system(
+            array_component("b", connector("vector_in", "input", inner=VECTOR)),
+            connection("v", "b.vector_in", linear(2, 1)),
+            f"<ssd:Connectors>{connector('v', 'input', inner=VECTOR)}</ssd:Connectors>"
+            + bindings(binding(array("v", "Real", "1 2 3", 3))),
+        )
+        + "</ssd:System>"
+    )
+    links = connection("a.float64_out", "s.v", attributes='endIndices="2"')
+    links += connection("a.matrix_out", "s.v", "", 'startIndices="2 3" endIndices="3"')
+    elements = ssd(system(array_component("a", outs, bindings(values)) + inside, links))
+    shared = bus_system(defined(f">{dictionary(ENTRIES, UNITS.replace('ssd:', 'ssb:'))}"))
+    mapped = through(table("Enumeration", low="high"), table("Integer", _2=7), GEAR, MODE)
+    return [NESTED, elements, shared, mapped]
+
+
+WORDS = (
+    *("", " ", "1", "2", "-1", "1 2", "1 2 3", "1e400", "nan", "9" * 23, "1.0", "2.0", "true"),
+    *("input", "output", "inout", "unspecified", "parameter", "s", "a", "v", "x_c", "bus", "gear"),
+    *("m", "mm", "kg", "[1]", "v[1]", "#s", ".", "low", "resources/wheel.fmu"),
+)
+
+
+def mutated(random: Random, description: str) -> bytes:
+    """A description in which a few attributes and elements are changed, moved or left out."""
+    root = etree.fromstring(description.encode())
+    for _ in range(random.randint(1, 4)):
+        elements = list(root.iter())
+        element, other = random.choice(elements[1:]), random.choice(elements[1:])
+        parent = element.getparent()
+        match random.choice(("set", "set", "set", "drop", "remove", "repeat", "nest")):
+            case "set" if element.attrib:
+                element.set(random.choice(list(element.attrib)), random.choice(WORDS))
+            case "drop" if element.attrib:
+                del element.attrib[random.choice(list(element.attrib))]
+            case "remove" if parent is not None:
+                parent.remove(element)
+            case "repeat" if parent is not None:
+                parent.append(deepcopy(element))
+            case "nest":
+                element.append(deepcopy(other))
+    return etree.tostring(root)
+
+
+def test_damaged_descriptions_are_read_or_refused(tmp_path: Path, capability_dir: Path) -> None:
+    """Law: whatever a document says, reading it ends, and with no other error than our own."""
+    random, outcomes = Random(3), {"read": 0, "refused": 0}
+    (tmp_path / "resources").mkdir()
+    for name in ("wheel", "chassis", "all_types3"):
+        (tmp_path / "resources" / f"{name}.fmu").touch()
+    path = tmp_path / "damaged.ssd"
+    descriptions = every_element()
+    for description in descriptions:
+        path.write_text(description, encoding="utf-8")
+        assert outcome(path, capability_dir) == "read"
+    for _ in range(500):
+        path.write_bytes(mutated(random, random.choice(descriptions)))
+        outcomes[outcome(path, capability_dir)] += 1
+    assert min(outcomes.values()) > 25, outcomes
+
+
+def outcome(path: Path, models: Path) -> str:
+    """Whether a description is read or refused, with FMUs of all types for its components."""
+    notes = Notes(str(path))
+    try:
+        structure = read_structure(path, path.parent, notes)
+        flatten(structure.system, lambda _: described(models / "all_types3.fmu"), notes)
+    except ConfigurationError:
+        return "refused"
+    assert all(notes.sentences())
+    return "read"
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 but not more", b"<x/>"])
