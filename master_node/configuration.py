@@ -6,6 +6,7 @@ Every message names file, table and key. ``docs/system-file.md`` explains each k
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -24,6 +25,7 @@ from pydantic import (
     StrictStr,
     Tag,
     ValidationError,
+    ValidationInfo,
     field_serializer,
     field_validator,
     model_validator,
@@ -85,6 +87,28 @@ def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:
     if not value:
         raise ValueError("must not be empty")
     return value
+
+
+_BOOLEAN_KEYS = {"true": True, "false": False}
+
+
+def _mapping(value: Any) -> Mapping[bool, bool] | Mapping[int, int]:
+    """The entries of a mapping; keys of TOML are texts."""
+    wrong = ValueError("write { false = true, … } or { 1 = 2, … }: booleans, or whole numbers")
+    if not isinstance(value, Mapping) or not value:
+        raise wrong
+    entries: dict[Any, Any] = {}
+    for key, target in value.items():
+        source = _BOOLEAN_KEYS.get(key, key) if isinstance(key, str) else key
+        if isinstance(source, str) and re.fullmatch(r"[+-]?[0-9]{1,20}", source):
+            source = int(source)
+        if source in entries:
+            raise ValueError(f"{key} is there twice")
+        entries[source] = target
+    kinds = {type(entry) for pair in entries.items() for entry in pair}
+    if kinds not in ({bool}, {int}):
+        raise wrong
+    return entries
 
 
 Number = Annotated[StrictFloat, AfterValidator(_finite)]
@@ -383,6 +407,8 @@ class Connection(_Table):
     Attributes:
         factor, offset: input = factor * output + offset, in place of a conversion of units.
         ignore_units: hand the value on as it is, whatever the units.
+        mapping: what becomes of single values of an output that is a boolean, an integer or an
+            enumeration; others are handed on as they are. All are booleans, or all integers.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
@@ -392,6 +418,21 @@ class Connection(_Table):
     factor: Number | None = None
     offset: Number | None = None
     ignore_units: StrictBool = False
+    mapping: Mapping[bool, bool] | Mapping[int, int] | None = None
+
+    @field_validator("mapping", mode="plain")
+    @classmethod
+    def _entries(
+        cls, value: Any, info: ValidationInfo
+    ) -> Mapping[bool, bool] | Mapping[int, int] | None:
+        beside = [key for key in ("factor", "offset", "ignore_units") if info.data.get(key)]
+        if value is not None and beside:
+            raise ValueError(f"cannot stand beside {beside[0]}")
+        return None if value is None else _mapping(value)
+
+    @field_serializer("mapping")
+    def _as_table(self, value: Mapping[int, int] | None) -> dict[str, int] | None:
+        return None if value is None else {str(key).lower(): v for key, v in value.items()}
 
     @model_validator(mode="before")
     @classmethod

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from master_node.configuration import Connection, System
-from master_node.type_casts import Cast, cast
+from master_node.type_casts import Cast, cast, mapped_cast
 from master_node.units import (
     IDENTITY,
     Transformation,
@@ -144,6 +144,16 @@ def _connection(
     where: str, connection: Connection, source: End, target: End, descriptions: Descriptions
 ) -> ScalarConnection:
     types = source.variable.type, target.variable.type
+    if connection.mapping is not None:
+        mapped = mapped_cast(*types, connection.mapping)
+        if mapped is None:
+            raise ConfigurationError(
+                f"{where}: mapping: {source.reference} is of type {types[0]}, {target.reference} "
+                f"of type {types[1]}, and the mapping is not from the one to the other",
+                remedy="map booleans to booleans, or integers and enumerations to values that "
+                "the input can have",
+            )
+        return ScalarConnection(source, target, IDENTITY, mapped)
     how = cast(*types)
     if how is None:
         raise ConfigurationError(

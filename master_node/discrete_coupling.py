@@ -13,6 +13,7 @@ from functools import cached_property
 from master_node.connections import ScalarConnection
 from master_node.type_casts import Cast
 from master_node.units import Transformation
+from protocol.errors import SlaveError
 from protocol.signals import FloatArray
 from protocol.slave import Causality, SlaveDescription, StartValue, VariableType
 
@@ -28,21 +29,43 @@ class HeldInput:
     """Where the value of a discrete input comes from.
 
     Attributes:
+        slave, name: of the input.
         output: index among the discrete outputs; None if the output is continuous.
         continuous_output: index among the continuous outputs; None if it is discrete.
         start: of the input, where its output is not known yet; None: it has none.
     """
 
+    slave: str
+    name: str
     output: int | None
     continuous_output: int | None
     cast: Cast
     transformation: Transformation
     start: StartValue | None
 
-    def value(self, y: FloatArray, d: DiscreteValues) -> StartValue:
-        """The value that belongs to outputs ``y``, shape (m,), and discrete outputs ``d``."""
+    def value(self, y: FloatArray, d: DiscreteValues, time: float) -> StartValue:
+        """The value that belongs to outputs.
+
+        Args:
+            y: continuous outputs, shape (m,).
+            d: discrete outputs.
+            time: of the outputs [s].
+
+        Raises:
+            SlaveError: a mapping knows no such value, and the types have no cast.
+        """
         if self.output is not None:
-            value = self.cast(d[self.output])
+            try:
+                value = self.cast(d[self.output])
+            except KeyError:
+                raise SlaveError(
+                    f"the mapping of input {self.name!r} has no entry for the value "
+                    f"{d[self.output]!r:.60}, and the types allow no other way",
+                    slave=self.slave,
+                    phase="set_discrete_inputs",
+                    time=time,
+                    remedy="add the value to the mapping of the connection",
+                ) from None
         else:
             value = float(y[self.continuous_output])
         if self.transformation.is_identity:
@@ -89,16 +112,20 @@ class DiscreteCoupling:
         feeding = {held.output for inputs in self.inputs for held in inputs}
         return tuple(sorted(index for index in feeding if index is not None))
 
-    def held(self, y: FloatArray, d: DiscreteValues) -> Held:
+    def held(self, y: FloatArray, d: DiscreteValues, time: float) -> Held:
         """The discrete inputs that belong to outputs.
 
         Args:
             y: continuous outputs, shape (m,).
             d: discrete outputs.
+            time: of the outputs [s].
+
+        Raises:
+            SlaveError: a mapping of a connection has no entry for a value.
         """
         if not self.holds_inputs:
             return ()
-        return tuple(tuple(held.value(y, d) for held in inputs) for inputs in self.inputs)
+        return tuple(tuple(held.value(y, d, time) for held in inputs) for inputs in self.inputs)
 
     def filled(self, known: DiscreteValues, before: DiscreteValues) -> DiscreteValues:
         """Discrete outputs with those of ``before`` where nobody was asked."""
@@ -145,6 +172,8 @@ def couple_discrete(
         tuple(
             tuple(
                 HeldInput(
+                    feed.target.slave,
+                    feed.target.variable.name,
                     index.get(feed.source.key),
                     continuous_outputs.get(feed.source.key),
                     feed.cast,

@@ -127,7 +127,7 @@ class _InitializationMode:
         def again(y: FloatArray) -> FloatArray:
             nonlocal outputs
             outputs = self._round(
-                self._inputs(coupled.inputs_of(y), self._coupled.discrete.held(y, outputs.d))
+                self._inputs(coupled.inputs_of(y), coupled.discrete.held(y, outputs.d, self._start))
             )
             values: FloatArray = outputs.y[0]
             return values
@@ -173,7 +173,7 @@ class _InitializationMode:
                 source_level = order.levels[held.continuous_output]
             if source_level > level and held.start is not None:
                 return held.start
-            return held.value(outputs.y[0], outputs.d)
+            return held.value(outputs.y[0], outputs.d, self._start)
 
         return tuple(tuple(map(value, inputs)) for inputs in discrete.inputs)
 

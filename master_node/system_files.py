@@ -23,7 +23,7 @@ import tomli_w
 from master_node.configuration import System, load_system
 from master_node.ssp.flattening import Slave, flatten
 from master_node.ssp.reading import read_structure
-from master_node.ssp.structure import Notes, Structure
+from master_node.ssp.structure import Notes, Structure, listed
 from master_node.ssp.writing import write_package
 from protocol.errors import ConfigurationError
 from protocol.keys import check_name
@@ -87,7 +87,9 @@ def read_ssp(path: Path, scratch: Path) -> ImportedSystem:
     unknown = sorted(tables["slaves"].keys() - {slave.name for slave in slaves})
     if unknown:
         raise ConfigurationError(f"{path}: the annotation has settings of {unknown[0]!r}, no slave")
+    more = {name: tables[name] for name in ("inputs", "results") if tables[name]}
     system = System(
+        **more,
         simulation=tables["simulation"],
         slaves={slave.name: _slave(slave, base, tables["slaves"], path) for slave in slaves},
         connections=tuple(connections),
@@ -163,9 +165,13 @@ def _settings(structure: Structure, path: Path, notes: Notes) -> dict[str, dict[
         given = tomllib.loads(structure.settings)
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError(f"{where} is not TOML: {error}") from None
-    tables = {name: given.pop(name, {}) for name in ("simulation", "slaves", "bus")}
+    names = ("simulation", "slaves", "inputs", "results", "bus")
+    tables = {name: given.pop(name, {}) for name in names}
     if given or not all(isinstance(table, dict) for table in tables.values()):
-        raise ConfigurationError(f"{where} holds more than [simulation], [slaves] and [bus]")
+        raise ConfigurationError(f"{where} holds more than {listed(list(names))}")
+    for name, value in tables["inputs"].items():
+        if not isinstance(value, int | float):  # a function is a program, a table any file
+            raise ConfigurationError(f"{where} cannot give [inputs] {name!r} more than a number")
     if tables["bus"].pop("insecure", False):
         notes.tell(
             f"{path}: [bus] insecure = true is not taken from a package; say --insecure if you "
@@ -230,10 +236,21 @@ def _toml(tables: dict[str, Any]) -> str:
     """A system file, with its tables in the usual order."""
     parts = [{name: tables[name]} for name in ("simulation", "slaves") if tables.get(name)]
     texts = [tomli_w.dumps(part) for part in parts]
-    texts += [f"[[connections]]\n{tomli_w.dumps(table)}" for table in tables["connections"]]
-    if tables.get("bus"):
-        texts.append(tomli_w.dumps({"bus": tables["bus"]}))
+    texts += [_connection(table) for table in tables["connections"]]
+    texts += [
+        tomli_w.dumps({name: tables[name]})
+        for name in ("inputs", "results", "bus")
+        if tables.get(name)
+    ]
     return "\n".join(texts)
+
+
+def _connection(table: dict[str, Any]) -> str:
+    """With an inline table for its mapping, whose keys are booleans or numbers."""
+    mapping = table.pop("mapping", {})
+    text = f"[[connections]]\n{tomli_w.dumps(table)}"
+    entries = ", ".join(f"{key} = {str(value).lower()}" for key, value in mapping.items())
+    return f"{text}mapping = {{ {entries} }}\n" if mapping else text
 
 
 def _replace(output: Path, write: Callable[[Path], object]) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 from protocol.slave import StartValue, VariableType
 
@@ -34,6 +35,57 @@ def cast(source: VariableType, target: VariableType) -> Cast | None:
     if source.integer_range is not None:
         return _from_integer(source.integer_range, target)
     return None
+
+
+@dataclass(frozen=True, slots=True)
+class MappedCast:
+    """A cast by a table of single values; KeyError for one that neither it nor a cast is for.
+
+    Attributes:
+        entries: what a value becomes.
+        unmapped: for all other values; None: there is no cast between the types.
+    """
+
+    entries: Mapping[bool, bool] | Mapping[int, int]
+    unmapped: Cast | None
+
+    def __call__(self, value: StartValue) -> StartValue:
+        """The value of the one type that belongs to ``value`` of the other."""
+        mapped = self.entries.get(value)  # type: ignore[arg-type]
+        if mapped is not None:
+            return mapped
+        if self.unmapped is None:
+            raise KeyError(value)
+        return self.unmapped(value)
+
+
+def mapped_cast(
+    source: VariableType,
+    target: VariableType,
+    entries: Mapping[bool, bool] | Mapping[int, int],
+) -> MappedCast | None:
+    """How values of one type become some of another by a mapping.
+
+    Args:
+        source: type of the output.
+        target: type of the input.
+        entries: booleans to booleans, or integers to integers.
+
+    Returns:
+        None if the types are not those of the entries: both Boolean, or both integers or
+        enumerations; or if an entry does not fit the type ``target``.
+    """
+    types = (source, target)
+    if all(isinstance(value, bool) for pair in entries.items() for value in pair):
+        fits = types == (VariableType.BOOLEAN, VariableType.BOOLEAN)
+    else:
+        bounds = target.integer_range
+        fits = (
+            source.integer_range is not None
+            and bounds is not None
+            and all(bounds[0] <= value <= bounds[1] for value in entries.values())
+        )
+    return MappedCast(entries, cast(source, target)) if fits else None
 
 
 def _from_boolean(target: VariableType) -> Cast | None:

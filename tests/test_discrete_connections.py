@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from master_node import Result, System, load_system, simulate
-from protocol.errors import ConfigurationError
+from protocol.errors import ConfigurationError, SlaveError
 from tests.conftest import EXAMPLES
 
 pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
@@ -123,6 +123,67 @@ def test_an_early_return_is_an_event(capability_dir: Path, in_process: bool) -> 
         assert result["model.y"][index] == pytest.approx(y, abs=1e-7)
     assert result.summary["discontinuities"] == 2
     assert result["model.level"].max() == 2
+
+
+def mapped(folder: Path, source: str, target: str, mapping: dict[Any, Any], **more: Any) -> System:
+    """The counter of one FMU drives another one through a mapping; four changes in a second."""
+    model = {"model": str(folder / "all_types2.fmu")}
+    return System(
+        simulation={"stop_time": 1.0, "smallest_step_size": 1e-7},
+        slaves={"clock": model, "device": model},
+        connections=[{"from": source, "to": target, "mapping": mapping, **more}],
+    )
+
+
+def test_values_are_mapped_by_a_table(capability_dir: Path) -> None:
+    """What has an entry becomes its target, all else is handed on as it is."""
+    ends = ("clock.counter_out", "device.integer_in")
+    result = simulate(mapped(capability_dir, *ends, {0: 10, 2: -7}), in_process=True)
+    table = np.array([10, 1, -7, 3, 4])
+    device = result["device.integer_out"]
+    assert (device[1:] == table[result["clock.counter_out"][:-1]] + 1).all()
+    ends = ("clock.toggle_out", "device.boolean_in")
+    result = simulate(mapped(capability_dir, *ends, {True: False, False: True}), in_process=True)
+    assert (result["device.boolean_out"][1:] == result["clock.toggle_out"][:-1]).all()
+
+
+def test_a_mapping_opens_a_way_between_types(capability_dir: Path) -> None:
+    """An integer becomes an enumeration; a value without an entry ends the run, with its place."""
+    ends = ("clock.counter_out", "device.enumeration_in")
+    whole = {0: 3, 1: 2, 2: 1, 3: 2, 4: 3}
+    result = simulate(mapped(capability_dir, *ends, whole), in_process=True)
+    assert set(result["device.enumeration_out"]) == {1, 2, 3}
+    with pytest.raises(SlaveError, match="'enumeration_in' has no entry for the value 2") as caught:
+        simulate(mapped(capability_dir, *ends, {0: 3, 1: 2}), in_process=True)
+    assert caught.value.slave == "device"
+    assert caught.value.time == pytest.approx(0.5, abs=0.05)
+    assert "add the value to the mapping" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("target", "mapping", "more", "told"),
+    [
+        ("integer_in", {0: True}, {}, "write { false = true, … } or { 1 = 2, … }"),
+        ("integer_in", {"x": 1}, {}, "write { false = true, … } or { 1 = 2, … }"),
+        ("integer_in", {}, {}, "write { false = true, … } or { 1 = 2, … }"),
+        ("integer_in", {"1": 1, "01": 2}, {}, "01 is there twice"),
+        ("integer_in", {1: 1}, {"factor": 2.0}, "cannot stand beside factor"),
+        ("integer_in", {1: 2**31}, {}, "the mapping is not from the one to the other"),
+        ("boolean_in", {1: 2}, {}, "the mapping is not from the one to the other"),
+        ("integer_in", {False: True}, {}, "the mapping is not from the one to the other"),
+        ("real_continuous_in", {1: 2}, {}, "the mapping is not from the one to the other"),
+    ],
+)
+def test_mappings_that_fit_nothing_are_refused(
+    capability_dir: Path, target: str, mapping: dict[Any, Any], more: dict[str, Any], told: str
+) -> None:
+    """Before anything starts, with the number of the connection."""
+    with pytest.raises(ConfigurationError, match="number 1") as caught:
+        simulate(
+            mapped(capability_dir, "clock.counter_out", f"device.{target}", mapping, **more),
+            in_process=True,
+        )
+    assert told in str(caught.value)
 
 
 def lags(folder: Path, source: str, target: str, **connection: Any) -> System:

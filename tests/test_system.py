@@ -339,7 +339,7 @@ def test_what_is_not_continuous_goes_beside() -> None:
     assert coupled.discrete.names == ("a.n", "a.on")
     assert coupled.parts[1].inputs == ()
     assert coupled.parts[1].discrete_inputs == ("n", "level", "sampled")
-    values = coupled.discrete.held(np.array([2.5, 7.0]), (3, True))[1]
+    values = coupled.discrete.held(np.array([2.5, 7.0]), (3, True), 0.0)[1]
     assert values == (3, 1.0, 2.5)
     assert [type(value) for value in values] == [int, float, float]
 

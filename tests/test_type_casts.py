@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from master_node.type_casts import cast
+from master_node.type_casts import cast, mapped_cast
 from protocol.slave import VariableType
 
 INTEGERS = [kind for kind in VariableType if kind.integer_range is not None]
@@ -75,3 +75,24 @@ def test_clocks_carry_no_value() -> None:
     for kind in VariableType:
         assert cast(VariableType.CLOCK, kind) is None
         assert cast(kind, VariableType.CLOCK) is None
+
+
+@pytest.mark.parametrize(("source", "target"), list(itertools.product(VariableType, VariableType)))
+def test_a_mapping_is_for_booleans_or_for_integers(
+    source: VariableType, target: VariableType
+) -> None:
+    """Entries come first, then the cast between the types; without one there is no other value."""
+    booleans = mapped_cast(source, target, {True: False})
+    assert (booleans is not None) == (source is target is VariableType.BOOLEAN)
+    numbers = mapped_cast(source, target, {5: 7})
+    assert (numbers is not None) == (source in INTEGERS and target in INTEGERS)
+    if numbers is None:
+        return
+    assert numbers(5) == 7
+    if cast(source, target) is None:
+        with pytest.raises(KeyError):
+            numbers(6)
+    else:
+        assert numbers(6) == 6
+    assert target.integer_range is not None
+    assert mapped_cast(source, target, {5: target.integer_range[1] + 1}) is None

@@ -18,7 +18,7 @@ from fmu_framework.build_fmus import BuildError, build_fmus, main  # noqa: E402 
 __all__ = ["FILES", "MODELS", "BuildError", "build"]
 
 MODELS = ("chassis", "wheel")
-FILES = ("SystemStructure.ssd", "resources/road.ssv")
+FILES = ("SystemStructure.ssd", "resources/road.ssv", "resources/road.ssm")
 
 
 def build(output: Path, *, force: bool = False) -> list[Path]:

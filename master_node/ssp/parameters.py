@@ -3,34 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
-from master_node.ssp.structure import (
-    Linear,
-    Notes,
-    Parameter,
-    Table,
-    Transformation,
-    Unsupported,
-    Value,
-    listed,
-)
-from master_node.ssp.xml_nodes import Node, boolean, integer, number
-from protocol.errors import ConfigurationError
+from master_node.ssp.definitions import Definitions, read_definitions, read_dimensions
+from master_node.ssp.structure import Notes, Parameter, Scalar, Transformation, Value, listed
+from master_node.ssp.transformations import read_transformation
+from master_node.ssp.xml_nodes import Node, as_boolean, as_integer, as_number, boolean
 
-_REALS = ("ssv:Real", "ssv:Float64", "ssv:Float32")
-_INTEGERS = (
-    "ssv:Integer",
-    *(f"ssv:{sign}Int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "U")),
-)
-_TYPES = (*_REALS, *_INTEGERS, "ssv:Boolean", "ssv:String", "ssv:Enumeration", "ssv:Binary")
-_TRANSFORMATIONS = (
-    "ssc:LinearTransformation",
-    "ssc:BooleanMappingTransformation",
-    "ssc:IntegerMappingTransformation",
-    "ssc:EnumerationMappingTransformation",
-)
+_KINDS = {
+    **dict.fromkeys(("Real", "Float64", "Float32"), "Real"),
+    **dict.fromkeys(
+        (
+            "Integer",
+            *(f"{sign}Int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "U")),
+        ),
+        "Integer",
+    ),
+    **{name: name for name in ("Boolean", "String", "Enumeration", "Binary")},
+}
+_TYPES = tuple(f"ssv:{name}" for name in _KINDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +33,7 @@ class MappingEntry:
     source: str
     target: str
     transformation: Transformation | None
+    suppress_unit_conversion: bool
     place: str
 
 
@@ -63,12 +57,11 @@ def read_parameter_set(node: Node) -> tuple[Parameter, ...]:
     """
     check_version(node)
     node.attribute("name")
-    enumerations = _enumerations(node.child("ssv:Enumerations"))
-    node.children("ssv:Units")
+    definitions = read_definitions(node, "ssv")
     parameters: dict[str, Parameter] = {}
     container = node.child("ssv:Parameters")
     for child in container.children("ssv:Parameter") if container else ():
-        parameter = _parameter(child, enumerations)
+        parameter = _parameter(child, definitions)
         if parameter.name in parameters:
             raise child.error(f"{parameter.name!r} is there twice")
         parameters[parameter.name] = parameter
@@ -91,9 +84,9 @@ def read_mapping(node: Node) -> tuple[MappingEntry, ...]:
             source=child.required("source"),
             target=child.required("target"),
             transformation=read_transformation(child),
+            suppress_unit_conversion=boolean(child, "suppressUnitConversion", "false"),
             place=child.place,
         )
-        boolean(child, "suppressUnitConversion", "false")  # values are never converted
         child.done()
         if entry.target in entries:
             raise child.error(f"two parameters are mapped to {entry.target!r}")
@@ -102,144 +95,102 @@ def read_mapping(node: Node) -> tuple[MappingEntry, ...]:
     return tuple(entries.values())
 
 
-def read_transformation(node: Node) -> Transformation | None:
-    """The transformation of a connection or of a mapping entry, None if there is none.
-
-    Raises:
-        ConfigurationError: there are several, or a number is wrong.
-    """
-    found = node.children(*_TRANSFORMATIONS)
-    if not found:
-        return None
-    if len(found) > 1:
-        raise found[1].error("is a second transformation")
-    (transformation,) = found
-    match transformation.name:
-        case "ssc:LinearTransformation":
-            linear = Linear(
-                number(transformation, "factor", "1.0"), number(transformation, "offset", "0.0")
-            )
-            transformation.done()
-            return linear
-        case "ssc:BooleanMappingTransformation":
-            return _table(transformation, boolean)
-        case "ssc:IntegerMappingTransformation":
-            return _table(transformation, integer)
-    return Unsupported(transformation.name)
-
-
-def transformed(parameter: Parameter, transformation: Transformation | None) -> Parameter:
-    """The parameter with a transformed value.
-
-    Raises:
-        ConfigurationError: the value is not of a type that the transformation is for.
-    """
-    if transformation is None or transformation == Linear():
-        return parameter
-    value = parameter.usable()
-    where = f"{parameter.place}: parameter {parameter.name!r}"
-    match transformation:
-        case Linear():
-            if isinstance(value, str | bool):
-                raise ConfigurationError(f"{where}: a LinearTransformation of {value!r:.60}")
-            result = transformation(value)
-            if not math.isfinite(result):
-                raise ConfigurationError(f"{where}: the LinearTransformation gives {result}")
-            return replace(parameter, value=result)
-        case Table():
-            if not isinstance(value, int) or value not in transformation.entries:
-                raise ConfigurationError(f"{where}: no MapEntry for the value {value!r:.60}")
-            return replace(parameter, value=transformation.entries[value])
-        case Unsupported():
-            raise ConfigurationError(
-                f"{where}: {transformation.element} is not supported",
-                remedy="map the number by an IntegerMappingTransformation",
-            )
-
-
 def mapped(
     parameters: Sequence[Parameter], mapping: Sequence[MappingEntry], place: str, notes: Notes
 ) -> tuple[Parameter, ...]:
-    """The parameters under their new names, transformed; those without an entry are left out."""
+    """The parameters under their new names; those without an entry are left out.
+
+    A transformation is applied later, behind the conversion to the unit of the target.
+    """
     known = {parameter.name: parameter for parameter in parameters}
     result = []
     for entry in mapping:
         parameter = known.get(entry.source)
         if parameter is None:
             notes.tell(f"{entry.place}: no parameter {entry.source!r} is there to be mapped")
-        else:
-            result.append(replace(transformed(parameter, entry.transformation), name=entry.target))
+            continue
+        if entry.suppress_unit_conversion:
+            parameter = replace(parameter, unit="", definition=None)
+        result.append(replace(parameter, name=entry.target, transformation=entry.transformation))
     sources = {entry.source for entry in mapping}
     if unmapped := [name for name in known if name not in sources]:
         notes.tell(f"{place}: not mapped, so not applied: {listed(unmapped)}")
     return tuple(result)
 
 
-def _parameter(node: Node, enumerations: Mapping[str, Mapping[str, int]]) -> Parameter:
+def _parameter(node: Node, definitions: Definitions) -> Parameter:
     types = node.children(*_TYPES)
     if len(types) != 1:
         raise node.error("needs one element with its type and value")
-    (kind,) = types
-    problem, unit = "", ""
-    value: Value = 0
-    if node.children("ssv:Dimension", "ssc:Dimension"):
-        problem = "an array"
-        kind.attribute("value")
-        kind.children("ssv:Value")
-    elif kind.name in _REALS:
-        value, unit = number(kind, "value"), kind.attribute("unit")
-    elif kind.name in _INTEGERS:
-        value = integer(kind, "value")
-    elif kind.name == "ssv:Boolean":
-        value = boolean(kind, "value")
-    elif kind.name == "ssv:Binary":
-        problem = "a Binary value"
-        kind.attribute("value")
-        kind.attribute("mime-type")
-        kind.children("ssv:Value")
+    (element,) = types
+    kind = _KINDS[element.name.partition(":")[2]]
+    unit = element.attribute("unit")
+    items = definitions.enumerations.get(element.attribute("name"), {})
+    element.attribute("mime-type")
+    sizes = read_dimensions(node)
+    if kind in _TOKENS:
+        read, texts = _TOKENS[kind], element.required("value").split()
+        values: list[Scalar] = [read(element, text) for text in texts]
     else:
-        value = _text(kind)
-    if kind.name == "ssv:Enumeration" and not problem:
-        items = enumerations.get(kind.attribute("name"), {})
-        if value in items:
-            value = items[str(value)]
-        else:
-            problem = f"Enumeration item {value!r:.60} has no number in this file"
-    kind.attribute("unit")
-    kind.attribute("name")
-    kind.done()
-    parameter = Parameter(node.required("name"), value, unit, problem, node.place)
+        values = [_text(element, kind, text) for text in _texts(element)]
+    element.done()
+    parameter = Parameter(
+        node.required("name"),
+        _shaped(node, values, sizes),
+        kind,
+        unit,
+        definitions.units.get(unit),
+        items,
+        None,
+        node.place,
+    )
     node.done()
     return parameter
 
 
-def _text(node: Node) -> str:
-    values = node.children("ssv:Value")
-    if not values:
-        return node.attribute("value")
-    if len(values) > 1 or node.has("value"):
+_TOKENS: dict[str, Callable[[Node, str], Scalar]] = {
+    "Real": as_number,
+    "Integer": as_integer,
+    "Boolean": as_boolean,
+}
+
+
+def _texts(node: Node) -> list[str]:
+    """The value, or the values of an array, which have elements of their own."""
+    children = node.children("ssv:Value")
+    if not children:
+        return [node.attribute("value")]
+    if node.has("value"):
         raise node.error("has several values")
-    (value,) = values
-    value.done()
-    return value.text
+    texts = [child.attribute("value", child.text) for child in children]
+    for child in children:
+        child.done()
+    return texts
 
 
-def _enumerations(node: Node | None) -> dict[str, dict[str, int]]:
-    if node is None:
-        return {}
-    return {
-        enumeration.required("name"): {
-            item.required("name"): integer(item, "value")
-            for item in enumeration.children("ssc:Item")
-        }
-        for enumeration in node.children("ssc:Enumeration")
-    }
+def _text(node: Node, kind: str, text: str) -> str:
+    if kind == "Binary":
+        try:
+            return bytes.fromhex(text).hex()
+        except ValueError:
+            raise node.error(f"value = {text!r:.60} is not hexadecimal") from None
+    return text
 
 
-def _table(node: Node, read: Callable[[Node, str], int]) -> Table:
-    entries = {}
-    for entry in node.children("ssc:MapEntry"):
-        entries[read(entry, "source")] = read(entry, "target")
-        entry.done()
-    node.done()
-    return Table(entries)
+def _shaped(node: Node, values: list[Scalar], sizes: tuple[int | None, ...]) -> Value:
+    """The value itself, or those of an array as its rows."""
+    known = [size for size in sizes if size is not None]
+    if len(known) < len(sizes):
+        raise node.error("a Dimension of a parameter needs a size")
+    if len(values) != math.prod(known):
+        count = math.prod(known) if known else "one value"
+        raise node.error(f"has {len(values)} values in place of {count}")
+    return _rows(iter(values), known)
+
+
+def _rows(values: Iterator[Scalar], sizes: Sequence[int]) -> Value:
+    if not sizes:
+        return next(values)
+    if len(sizes) == 1:
+        return tuple(islice(values, sizes[0]))
+    return tuple(_rows(values, sizes[1:]) for _ in range(sizes[0]))

@@ -3,32 +3,33 @@
 from __future__ import annotations
 
 import posixpath
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
 
+from master_node.ssp.definitions import Definitions, read_connector, read_definitions
 from master_node.ssp.parameters import (
     MappingEntry,
     check_version,
     mapped,
     read_mapping,
     read_parameter_set,
-    read_transformation,
 )
 from master_node.ssp.structure import (
     Binding,
     Component,
     ConnectionElement,
     Connector,
+    Dictionary,
+    DictionaryReference,
     Notes,
     Parameter,
     Structure,
     SystemElement,
-    Unit,
     listed,
 )
-from master_node.ssp.xml_nodes import Node, boolean, integer, number, parse
+from master_node.ssp.transformations import read_transformation
+from master_node.ssp.xml_nodes import Node, as_integer, boolean, number, parse
 from protocol.archives import MAX_XML_BYTES, checked_archive
 from protocol.errors import ModelError
 from protocol.names import nearest
@@ -43,19 +44,12 @@ SSD_TYPE = "application/x-ssp-definition"
 SSP_TYPE = "application/x-ssp-package"
 SSV_TYPE = "application/x-ssp-parameter-set"
 SSM_TYPE = "application/x-ssp-parameter-mapping"
+SSB_TYPE = "application/x-ssp-signal-dictionary"
 
 MAX_DEPTH = 32
 MAX_ELEMENTS = 10_000
 MAX_PACKAGES = 100
-_BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-_TYPES = tuple(
-    f"ssc:{name}"
-    for name in (
-        *("Real", "Float64", "Float32", "Integer", "Boolean", "String", "Enumeration"),
-        *(f"{sign}Int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "U")),
-        "Binary",
-    )
-)
+_ELEMENTS = ("ssd:Component", "ssd:SignalDictionaryReference", "ssd:System")
 _KINDS = {
     *("input", "output", "parameter", "calculatedParameter", "inout"),
     *("structuralParameter", "constant", "local", "unspecified"),
@@ -151,7 +145,7 @@ class _Reader:
         root = self._parse(place, "ssd:SystemStructureDescription")
         check_version(root)
         root.attribute("name")
-        units = _units(root.child("ssd:Units"))
+        definitions = read_definitions(root, "ssd")
         system = root.child("ssd:System")
         if system is None:
             raise root.error("holds no ssd:System")
@@ -164,7 +158,7 @@ class _Reader:
             if experiment.has("stopTime"):
                 stop_time = number(experiment, "stopTime")
             experiment.done()
-        read = _Document(self, place, root, units).system(system, depth)
+        read = _Document(self, place, root, definitions).system(system, depth)
         root.done()
         return Structure(read, start_time, stop_time, settings)
 
@@ -206,6 +200,9 @@ class _Reader:
     def mapping(self, place: _Place) -> tuple[MappingEntry, ...]:
         return read_mapping(self._parse(place, "ssm:ParameterMapping"))
 
+    def dictionary(self, place: _Place) -> dict[str, Connector]:
+        return _entries(self._parse(place, "ssb:SignalDictionary"))
+
     def tell(self, sentence: str) -> None:
         self._notes.tell(sentence)
 
@@ -240,36 +237,63 @@ class _Document:
     reader: _Reader
     place: _Place
     root: Node
-    units: Mapping[str, Unit]
+    definitions: Definitions
 
     def system(self, node: Node, depth: int) -> SystemElement:
         self.reader.count(node, depth)
         name = node.required("name")
         connectors = self._connectors(node)
         bindings = self._bindings(node)
-        elements: dict[str, Component | SystemElement] = {}
+        elements: dict[str, Component | DictionaryReference | SystemElement] = {}
         container = node.child("ssd:Elements")
-        for child in _children(container, "ssd:Component", "ssd:System"):
-            element = (
-                self._component(child, depth + 1)
-                if child.name == "ssd:Component"
-                else self.system(child, depth + 1)
-            )
+        for child in _children(container, *_ELEMENTS):
+            element = self._element(child, depth + 1)
             if element.name in elements:
                 raise child.error(f"there are two elements {element.name!r}")
             elements[element.name] = element
         if container is not None:
-            for reference in container.children("ssd:SignalDictionaryReference"):
-                raise reference.error(
-                    "signal dictionaries are not supported", "connect the components directly"
-                )
             container.done()
         connections = node.child("ssd:Connections")
         read = tuple(self._connection(c) for c in _children(connections, "ssd:Connection"))
         if connections is not None:
             connections.done()
+        dictionaries = self._dictionaries(node.child("ssd:SignalDictionaries"))
         node.done()
-        return SystemElement(name, connectors, elements, read, bindings, node.place)
+        return SystemElement(name, connectors, elements, read, dictionaries, bindings, node.place)
+
+    def _element(self, node: Node, depth: int) -> Component | DictionaryReference | SystemElement:
+        match node.name:
+            case "ssd:Component":
+                return self._component(node, depth)
+            case "ssd:SignalDictionaryReference":
+                self.reader.count(node, depth)
+                reference = DictionaryReference(
+                    name=node.required("name"),
+                    dictionary=node.required("dictionary"),
+                    connectors=self._connectors(node),
+                    bindings=self._bindings(node),
+                    place=node.place,
+                )
+                node.done()
+                return reference
+        return self.system(node, depth)
+
+    def _dictionaries(self, node: Node | None) -> dict[str, Dictionary]:
+        dictionaries: dict[str, Dictionary] = {}
+        for child in _children(node, "ssd:SignalDictionary"):
+            name = child.required("name")
+            if name in dictionaries:
+                raise child.error(f"there are two signal dictionaries {name!r}")
+            place = self._source(child, SSB_TYPE)
+            if place is not None:
+                entries = self.reader.dictionary(place)
+                child.done()
+            else:
+                entries = _entries(_inline(child, "ssb:SignalDictionary"))
+            dictionaries[name] = Dictionary(name, entries, child.place)
+        if node is not None:
+            node.done()
+        return dictionaries
 
     def _component(self, node: Node, depth: int) -> Component | SystemElement:
         name = node.required("name")
@@ -346,38 +370,16 @@ class _Document:
         kind = node.required("kind")
         if kind not in _KINDS:
             raise node.error(f"kind {kind!r:.60} is not known")
-        problem = "" if kind not in ("inout", "unspecified") else f"kind {kind}"
-        unit = None
-        types = node.children(*_TYPES)
-        if len(types) > 1:
-            raise types[1].error("is a second type")
-        for child in types:
-            if child.name == "ssc:Binary":
-                problem = f"type {child.name}"
-            name = child.attribute("unit")
-            if name and name not in self.units:
-                raise child.error(f"unit {name!r} is not in ssd:Units{nearest(name, self.units)}")
-            unit = self.units.get(name)
-            child.attribute("name")
-            child.attribute("mime-type")
-            child.done()
-        if node.children("ssd:Dimension", "ssc:Dimension"):
-            problem = "an array"
-        if node.children("ssd:Clock", "ssc:Clock"):
-            problem = "a clock"
-        connector = Connector(node.required("name"), kind, unit, problem, node.place)
+        connector = read_connector(node, kind, self.definitions)
         node.done()
         return connector
 
     def _connection(self, node: Node) -> ConnectionElement:
-        for name in ("startIndices", "endIndices"):
-            if node.has(name):
-                raise node.error(
-                    f"{name}: elements of arrays cannot be connected", "connect scalar variables"
-                )
         connection = ConnectionElement(
             start=_end(node, "start"),
             end=_end(node, "end"),
+            start_indices=_indices(node, "startIndices"),
+            end_indices=_indices(node, "endIndices"),
             transformation=read_transformation(node),
             suppress_unit_conversion=boolean(node, "suppressUnitConversion", "false"),
             place=node.place,
@@ -448,23 +450,26 @@ def _end(node: Node, which: str) -> tuple[str | None, str]:
     return element, node.required(f"{which}Connector")
 
 
-def _units(node: Node | None) -> dict[str, Unit]:
-    units = {}
-    for child in _children(node, "ssc:Unit"):
-        base = child.child("ssc:BaseUnit")
-        if base is None:
-            raise child.error("has no ssc:BaseUnit")
-        name = child.required("name")
-        exponents = tuple(integer(base, unit, "0") for unit in _BASE_UNITS)
-        factor = number(base, "factor", "1")
-        if factor == 0.0:
-            raise base.error("a factor of 0")
-        units[name] = Unit(name, exponents, factor, number(base, "offset", "0"))
-        base.done()
+def _indices(node: Node, name: str) -> tuple[int, ...]:
+    indices = tuple(as_integer(node, text, name) for text in node.attribute(name).split())
+    if any(index < 1 for index in indices):
+        raise node.error(f"{name}: an index below 1", "indices count from 1")
+    return indices
+
+
+def _entries(node: Node) -> dict[str, Connector]:
+    """The entries of an ``ssb:SignalDictionary``, by name."""
+    check_version(node)
+    definitions = read_definitions(node, "ssb")
+    entries: dict[str, Connector] = {}
+    for child in node.children("ssb:DictionaryEntry"):
+        entry = read_connector(child, "", definitions)
+        if entry.name in entries:
+            raise child.error(f"{entry.name!r} is there twice")
+        entries[entry.name] = entry
         child.done()
-    if node is not None:
-        node.done()
-    return units
+    node.done()
+    return entries
 
 
 def _settings(root: Node) -> str:

@@ -5,14 +5,13 @@ Words are those of SSP 1.0 and 2.0. Nothing here knows XML or the settings of a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from protocol.errors import ConfigurationError
-
-Value = float | int | bool | str
-"""Of a parameter; an enumeration's is its number."""
+Scalar = float | int | bool | str
+Value = Scalar | tuple["Value", ...]
+"""Of a parameter: an array's are its rows, a binary's hexadecimal digits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,19 +54,45 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A boolean or integer mapping transformation: what each source value becomes."""
+    """A boolean or integer mapping transformation: what values become; others stay as they are.
+
+    Attributes:
+        is_boolean: whether all values are booleans, and not integers.
+    """
 
     entries: Mapping[int, int]
+    is_boolean: bool
+
+    def __call__(self, value: int) -> int:
+        """The target for one source value."""
+        return self.entries.get(value, value)
+
+    def then(self, later: Table) -> Table:
+        """This one first, and ``later`` on what it gives."""
+        both = {source: later(target) for source, target in self.entries.items()}
+        return Table({**later.entries, **both}, self.is_boolean)
 
 
 @dataclass(frozen=True, slots=True)
-class Unsupported:
-    """A transformation that cannot be carried, by the name of its element."""
+class ItemTable:
+    """An enumeration mapping transformation: what items become, by their names."""
 
-    element: str
+    entries: Mapping[str, str]
+
+    def __call__(self, item: str) -> str:
+        """The target for one source item."""
+        return self.entries.get(item, item)
+
+    def numbered(self, sources: Mapping[str, int], targets: Mapping[str, int]) -> Table:
+        """The same for the numbers of the items in both enumerations.
+
+        Raises:
+            KeyError: an item is not in its enumeration.
+        """
+        return Table({sources[a]: targets[b] for a, b in self.entries.items()}, is_boolean=False)
 
 
-Transformation = Linear | Table | Unsupported
+Transformation = Linear | Table | ItemTable
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +100,11 @@ class Connector:
     """An end of connections.
 
     Attributes:
-        kind: input, output, parameter, ...
+        kind: input, output, parameter, ...; "" of an entry of a signal dictionary.
         unit: as declared, None if none is.
+        items: of its enumeration, with their numbers; empty if it is none.
+        dimensions: sizes of an array, None for one that is not declared; empty for a scalar.
+        mime_type: of a binary, "" if none is declared.
         problem: why nothing can be connected to it, or "".
         place: file and line.
     """
@@ -84,6 +112,9 @@ class Connector:
     name: str
     kind: str
     unit: Unit | None
+    items: Mapping[str, int]
+    dimensions: tuple[int | None, ...]
+    mime_type: str
     problem: str
     place: str
 
@@ -96,12 +127,15 @@ class ConnectionElement:
 
     Attributes:
         start, end: element and connector; the element is None for a connector of the system.
+        start_indices, end_indices: of one element of an array, from 1; empty: the whole connector.
         suppress_unit_conversion: take numbers as they are.
         place: file and line.
     """
 
     start: tuple[str | None, str]
     end: tuple[str | None, str]
+    start_indices: tuple[int, ...]
+    end_indices: tuple[int, ...]
     transformation: Transformation | None
     suppress_unit_conversion: bool
     place: str
@@ -113,29 +147,24 @@ class Parameter:
 
     Attributes:
         name: as seen from the element that the binding belongs to.
+        value: an enumeration's is the name of an item until its number is known.
+        kind: name of the type in SSP, without its size: Real, Integer, Boolean, String,
+            Enumeration, Binary.
         unit: name of the unit of ``value``, "" if none is said.
-        problem: why the value cannot be used, or "".
+        definition: of that unit, None if the file has none.
+        items: numbers of the enumeration's items in the same file, empty if it has none.
+        transformation: still to be applied, in the unit of what the value is for.
         place: file and line.
     """
 
     name: str
     value: Value
+    kind: str
     unit: str
-    problem: str
+    definition: Unit | None
+    items: Mapping[str, int]
+    transformation: Transformation | None
     place: str
-
-    def usable(self) -> Value:
-        """The value.
-
-        Raises:
-            ConfigurationError: it is of a kind that cannot be carried.
-        """
-        if self.problem:
-            raise ConfigurationError(
-                f"{self.place}: parameter {self.name!r}: {self.problem}",
-                remedy="give it as a Real, Integer, Boolean or String, or leave it out",
-            )
-        return self.value
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,13 +192,45 @@ class Component:
 
 
 @dataclass(frozen=True, slots=True)
+class Dictionary:
+    """A signal dictionary: signals that references in several systems share.
+
+    Attributes:
+        entries: by name.
+        place: file and line.
+    """
+
+    name: str
+    entries: Mapping[str, Connector]
+    place: str
+
+
+@dataclass(frozen=True, slots=True)
+class DictionaryReference:
+    """Access to a signal dictionary of the same system, or of one that it is in.
+
+    Attributes:
+        dictionary: its name.
+        connectors: by the names of entries.
+        place: file and line.
+    """
+
+    name: str
+    dictionary: str
+    connectors: Mapping[str, Connector]
+    bindings: tuple[Binding, ...]
+    place: str
+
+
+@dataclass(frozen=True, slots=True)
 class SystemElement:
     """A system of components and systems; a component that refers to one is one as well."""
 
     name: str
     connectors: Mapping[str, Connector]
-    elements: Mapping[str, Component | SystemElement]
+    elements: Mapping[str, Component | DictionaryReference | SystemElement]
     connections: tuple[ConnectionElement, ...]
+    dictionaries: Mapping[str, Dictionary]
     bindings: tuple[Binding, ...]
     place: str
 
@@ -230,3 +291,15 @@ def listed(names: list[str]) -> str:
     """Names for a message, all of up to ten."""
     more = f" and {len(names) - 10} more" if len(names) > 10 else ""
     return ", ".join(map(repr, names[:10])) + more
+
+
+def each(change: Callable[[Scalar], Value], value: Value) -> Value:
+    """``change`` of a value, or of each element of an array."""
+    if isinstance(value, tuple):
+        return tuple(each(change, element) for element in value)
+    return change(value)
+
+
+def element_name(name: str, indices: tuple[int, ...]) -> str:
+    """``name[i,j]``; the name itself without indices."""
+    return f"{name}[{','.join(map(str, indices))}]" if indices else name

@@ -1,11 +1,11 @@
-"""A system as an SSP 1.0 package."""
+"""A system as an SSP package, of version 1.0 where that has the words for it, else of 2.0."""
 
 from __future__ import annotations
 
 import math
 import shutil
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import tomli_w
@@ -20,9 +20,10 @@ from master_node.ssp.reading import (
     SSV_TYPE,
 )
 from master_node.ssp.xml_nodes import NAMESPACES
+from master_node.start_values import GivenValue, structural_parameters
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
-from protocol.slave import SlaveDescription, VariableType
+from protocol.slave import SlaveDescription, StartValue, Variable, VariableType
 
 _Describe = Callable[[str, Path], SlaveDescription]
 _SSD, _SSC, _SSV = (f"{{{NAMESPACES[prefix]}}}" for prefix in ("ssd", "ssc", "ssv"))
@@ -37,6 +38,11 @@ _TYPES = {
 """What SSP 1.0 calls the types of variables, as far as it has them."""
 
 _SMALLEST_INTEGER, _LARGEST_INTEGER = -(2**31), 2**31 - 1
+_KINDS = ("Boolean", "String", "Binary", "Integer", "Int64", "UInt64", "Real")
+"""Of numbers the later one is for all of an array that has both."""
+
+_NUMBERS = frozenset(_KINDS[3:])
+_NOT_IN_1_0 = {f"{_SSC}Dimension", *(f"{_SSV}{sign}Int64" for sign in ("", "U"))}
 
 
 def write_package(
@@ -55,6 +61,7 @@ def write_package(
         ConfigurationError: something cannot be said in SSP, with slave or connection.
         OSError: the package cannot be written, or a model cannot be read.
     """
+    _check_inputs(system)
     descriptions = {}
     for slave, settings in system.slaves.items():
         try:
@@ -113,7 +120,7 @@ def _description(
                 kinds[source[1]] = "output"
             if target[0] == slave:
                 kinds[target[1]] = "input"
-        _add_connectors(component, kinds, descriptions[slave])
+        _add_connectors(component, kinds, descriptions[slave], settings)
         if settings.parameters:
             bindings = etree.SubElement(component, f"{_SSD}ParameterBindings")
             etree.SubElement(
@@ -132,18 +139,26 @@ def _description(
 
 
 def _add_connectors(
-    component: etree._Element, kinds: Mapping[str, str], description: SlaveDescription
+    component: etree._Element,
+    kinds: Mapping[str, str],
+    description: SlaveDescription,
+    settings: SlaveSettings,
 ) -> None:
     if not kinds:
         return
     connectors = etree.SubElement(component, f"{_SSD}Connectors")
+    is_resized = not structural_parameters(description).isdisjoint(settings.parameters)
     for name, kind in kinds.items():
         connector = etree.SubElement(connectors, f"{_SSD}Connector", name=name, kind=kind)
+        elements = _elements(description, name)
         # An enumeration would have to be defined here, and a unit as well: without them those of
         # the FMU hold.
-        type_ = _TYPES.get(description.variable(name).type)
+        type_ = _TYPES.get(elements[-1].type)
         if type_ is not None:
             etree.SubElement(connector, f"{_SSC}{type_}")
+        for size in _sizes(name, elements[-1].name):
+            known = {} if is_resized else {"size": size}
+            etree.SubElement(connector, f"{_SSC}Dimension", known)
 
 
 def _add_connection(
@@ -170,6 +185,18 @@ def _add_connection(
             factor=repr(float(1.0 if connection.factor is None else connection.factor)),
             offset=repr(float(connection.offset or 0.0)),
         )
+    if connection.mapping is not None:
+        _add_mapping(element, connection.mapping)
+
+
+def _add_mapping(
+    connection: etree._Element, mapping: Mapping[bool, bool] | Mapping[int, int]
+) -> None:
+    kind = "Boolean" if isinstance(next(iter(mapping)), bool) else "Integer"
+    table = etree.SubElement(connection, f"{_SSC}{kind}MappingTransformation")
+    for source, target in mapping.items():
+        entry = {"source": str(source).lower(), "target": str(target).lower()}
+        etree.SubElement(table, f"{_SSC}MapEntry", entry)
 
 
 def _add_experiment(root: etree._Element, system: System) -> None:
@@ -193,6 +220,8 @@ def _add_settings(root: etree._Element, system: System) -> None:
             exclude_unset=True, exclude_none=True, exclude={"start_time", "stop_time"}
         ),
         "slaves": {name: table for name, table in slaves.items() if table},
+        "inputs": dict(system.inputs),
+        "results": system.results.model_dump(exclude_unset=True),
         "bus": system.bus.model_dump(exclude_unset=True, exclude_none=True),
     }
     text = tomli_w.dumps({name: table for name, table in tables.items() if table})
@@ -212,38 +241,99 @@ def _parameter_set(
     root = etree.Element(
         f"{_SSV}ParameterSet",
         {"version": "1.0", "name": slave, "generationTool": "Doublestep"},
-        nsmap={"ssv": NAMESPACES["ssv"]},
+        nsmap={prefix: NAMESPACES[prefix] for prefix in ("ssv", "ssc")},
     )
     parameters = etree.SubElement(root, f"{_SSV}Parameters")
-    names = [variable.name for variable in description.variables]
     for name, value in settings.parameters.items():
         where = f"{system.source}: [slaves.{slave}.parameters] {name!r}"
-        if name not in names:
+        elements = _elements(description, name)
+        if not elements:  # an element that is there when a structural parameter has sized the array
+            elements = _elements(description, name.rpartition("[")[0])
+        if not elements:
+            names = [variable.name for variable in description.variables]
             raise ConfigurationError(f"{where}: no such variable{nearest(name, names)}")
         try:
             parameter = etree.SubElement(parameters, f"{_SSV}Parameter", name=name)
-            kind, text = _value(value, description.variable(name).type, where)
-            etree.SubElement(parameter, f"{_SSV}{kind}", value=text)
+            _add_value(parameter, value, elements[0].type, where)
         except ValueError as error:  # characters that XML does not have
             raise ConfigurationError(f"{where}: cannot be written as XML: {error}") from None
     return _text(root)
 
 
-def _value(value: object, type_: VariableType, where: str) -> tuple[str, str]:
+def _add_value(
+    parameter: etree._Element, value: GivenValue, type_: VariableType, where: str
+) -> None:
+    values, sizes = _flat(value, where)
+    pairs = [_value(one, type_, where) for one in values]
+    kinds = sorted({kind for kind, _ in pairs}, key=_KINDS.index)
+    kind = kinds[-1]
+    if len(kinds) > 1 and not _NUMBERS.issuperset(kinds):
+        raise ConfigurationError(f"{where}: an array of {' and '.join(kinds)}")
+    texts = [text for _, text in pairs]
+    if kind in ("String", "Binary") and sizes:
+        element = etree.SubElement(parameter, f"{_SSV}{kind}")
+        for text in texts:
+            etree.SubElement(element, f"{_SSV}Value", value=text)
+    else:
+        etree.SubElement(parameter, f"{_SSV}{kind}", value=" ".join(texts) if sizes else texts[0])
+    for size in sizes:
+        etree.SubElement(parameter, f"{_SSC}Dimension", size=str(size))
+
+
+def _flat(value: GivenValue, where: str) -> tuple[list[StartValue], list[int]]:
+    """The values of an array in row-major order, and its sizes; none for a single value."""
+    if isinstance(value, str | bytes) or not isinstance(value, Sequence):
+        return [value], []
+    parts = [_flat(part, where) for part in value]
+    sizes = [inner for _, inner in parts]
+    if not parts or any(inner != sizes[0] for inner in sizes):
+        raise ConfigurationError(
+            f"{where} = {value!r:.60}: its rows have different sizes, or none",
+            remedy="give all elements of the array",
+        )
+    return [one for values, _ in parts for one in values], [len(parts), *sizes[0]]
+
+
+def _value(value: StartValue, type_: VariableType, where: str) -> tuple[str, str]:
     """The SSV type and text of a start value."""
     if isinstance(value, bool):
         return "Boolean", "true" if value else "false"
     if isinstance(value, str):
-        return "String", value
+        return "Binary" if type_ is VariableType.BINARY else "String", value
     if not isinstance(value, int | float):
-        raise ConfigurationError(f"{where} = {value!r:.60}: SSP 1.0 has no such value")
+        raise ConfigurationError(f"{where} = {value!r:.60}: SSP has no such value")
     if not math.isfinite(value):
         raise ConfigurationError(f"{where} = {value}: is not a finite number")
     if isinstance(value, float) or _TYPES.get(type_) == "Real":
         return "Real", repr(float(value))
-    if not _SMALLEST_INTEGER <= value <= _LARGEST_INTEGER:
-        raise ConfigurationError(f"{where} = {value}: has more than 32 bits")
-    return "Integer", str(value)
+    if _SMALLEST_INTEGER <= value <= _LARGEST_INTEGER:
+        return "Integer", str(value)
+    for kind, bits in (("Int64", VariableType.INT64), ("UInt64", VariableType.UINT64)):
+        smallest, largest = bits.integer_range or (0, 0)
+        if smallest <= value <= largest:
+            return kind, str(value)
+    raise ConfigurationError(f"{where} = {value}: has more than 64 bits")
+
+
+def _check_inputs(system: System) -> None:
+    for name, value in system.inputs.items():
+        if not isinstance(value, int | float):
+            raise ConfigurationError(
+                f"{system.source}: [inputs] {name!r}: a table or a function cannot be put into a "
+                "package",
+                remedy="export the system without it, and name it again in the imported file",
+            )
+
+
+def _elements(description: SlaveDescription, name: str) -> list[Variable]:
+    """The variable of that name, or all elements of that array; empty if there is none."""
+    found = [v for v in description.variables if v.name == name]
+    return found or [v for v in description.variables if v.name.startswith(f"{name}[")]
+
+
+def _sizes(name: str, last: str) -> list[str]:
+    """The sizes of the array ``name`` by its last element; none for a single variable."""
+    return last.removeprefix(name)[1:-1].split(",") if last != name else []
 
 
 def _ends(
@@ -266,11 +356,14 @@ def _variable(
     )
     for slave in slaves:
         name = reference.removeprefix(f"{slave}.")
-        if any(variable.name == name for variable in descriptions[slave].variables):
+        if _elements(descriptions[slave], name):
             return slave, name
     raise ConfigurationError(f"{where}: no slave has a variable of that name")
 
 
 def _text(root: etree._Element) -> bytes:
+    """The document, of version 2.0 if it has an element that 1.0 has not."""
+    if any(element.tag in _NOT_IN_1_0 for element in root.iter()):
+        root.set("version", "2.0")
     text: bytes = etree.tostring(root, encoding="UTF-8", xml_declaration=True, pretty_print=True)
     return text

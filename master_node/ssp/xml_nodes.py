@@ -36,7 +36,6 @@ _WITHOUT_INFLUENCE = {
     "ssd:ConnectorGeometry",
     "ssd:ConnectionGeometry",
     "ssd:GraphicalElements",
-    "ssd:SignalDictionaries",
     "ssc:MetaData",
     "ssc:Signature",
     "ssd:MetaData",
@@ -45,8 +44,9 @@ _WITHOUT_INFLUENCE = {
     "ssv:Signature",
     "ssm:MetaData",
     "ssm:Signature",
-    "ssd:Enumerations",
-    "ssv:Enumerations",
+    "ssb:MetaData",
+    "ssb:Signature",
+    "ssd:SSDVariant",
 }
 
 
@@ -202,7 +202,33 @@ def number(node: Node, name: str, default: str = "") -> float:
     Raises:
         ConfigurationError: it is missing, no number, or not finite.
     """
-    text = (node.attribute(name, default) if default else node.required(name)).strip()
+    return as_number(node, _given(node, name, default), name)
+
+
+def integer(node: Node, name: str, default: str = "") -> int:
+    """An attribute of an integer type.
+
+    Raises:
+        ConfigurationError: it is missing or no whole number.
+    """
+    return as_integer(node, _given(node, name, default), name)
+
+
+def boolean(node: Node, name: str, default: str = "") -> bool:
+    """An attribute of type xs:boolean.
+
+    Raises:
+        ConfigurationError: it is missing, or neither true nor false.
+    """
+    return as_boolean(node, _given(node, name, default), name)
+
+
+def as_number(node: Node, text: str, name: str = "value") -> float:
+    """``text`` of an attribute of ``node`` as an xs:double.
+
+    Raises:
+        ConfigurationError: it is no number, or not finite.
+    """
     try:
         value = math.nan if "_" in text else float(text)
     except ValueError:
@@ -212,28 +238,30 @@ def number(node: Node, name: str, default: str = "") -> float:
     return value
 
 
-def integer(node: Node, name: str, default: str = "") -> int:
-    """An attribute of an integer type.
+def as_integer(node: Node, text: str, name: str = "value") -> int:
+    """``text`` of an attribute of ``node`` as a whole number.
 
     Raises:
-        ConfigurationError: it is missing or no whole number.
+        ConfigurationError: it is none.
     """
-    text = (node.attribute(name, default) if default else node.required(name)).strip()
     if not re.fullmatch(r"[+-]?[0-9]{1,20}", text):
         raise node.error(f"{name} = {text!r:.60} is not a whole number")
     return int(text)
 
 
-def boolean(node: Node, name: str, default: str = "") -> bool:
-    """An attribute of type xs:boolean.
+def as_boolean(node: Node, text: str, name: str = "value") -> bool:
+    """``text`` of an attribute of ``node`` as an xs:boolean.
 
     Raises:
-        ConfigurationError: it is missing, or neither true nor false.
+        ConfigurationError: it is neither true nor false.
     """
-    text = (node.attribute(name, default) if default else node.required(name)).strip()
     if text not in _BOOLEANS:
         raise node.error(f"{name} = {text!r:.60} is neither true nor false")
     return _BOOLEANS[text]
 
 
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
+
+
+def _given(node: Node, name: str, default: str) -> str:
+    return (node.attribute(name, default) if default else node.required(name)).strip()
