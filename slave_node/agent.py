@@ -13,6 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from shutil import rmtree
@@ -261,6 +262,7 @@ class Agent:
                 raise SlaveBusyError(f"run {request.run} has ended, or has another such slave")
             if started is not None:
                 end_all([started[1]], at_once=True)
+                self._forget(started[1])
             self._check(request)
             base, model = self._model(request.model)
             process = self._process(model, base, request.slave, request.run)
@@ -435,6 +437,11 @@ class Agent:
             self._runs.pop(run, None)
         for process in processes:
             log.info("ended %s of run %s", process.key.name, run)
-            if self._surroundings.logs is None:
-                process.log.unlink(missing_ok=True)
-            rmtree(self._surroundings.scratch / process.key.instance, ignore_errors=True)
+            self._forget(process)
+
+    def _forget(self, process: SlaveProcess) -> None:
+        """Remove what a process that has ended leaves behind."""
+        if self._surroundings.logs is None:
+            with suppress(OSError):
+                process.log.unlink()
+        rmtree(self._surroundings.scratch / process.key.instance, ignore_errors=True)

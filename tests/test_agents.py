@@ -498,12 +498,13 @@ class Served:
     """An agent on a bus within this process; processes that it starts are real."""
 
     def __init__(self, tmp_path: Path, offer: Offer) -> None:
-        (tmp_path / "slaves").mkdir()
+        self.scratch = tmp_path / "slaves"
+        self.scratch.mkdir()
         self.bus = InProcessBus()
         self._ending = threading.Event()
         # Nobody listens there: the slaves wait for a router until they are ended.
         connection = ["--connect", "tcp/127.0.0.1:1", "--mode", "client"]
-        self.agent = Agent(self.bus, KEY, offer, Surroundings(connection, tmp_path / "slaves"))
+        self.agent = Agent(self.bus, KEY, offer, Surroundings(connection, self.scratch))
         self._thread = threading.Thread(target=self.agent.serve, args=(self._ending,))
         self._thread.start()
         wait_until(lambda: bool(self.bus.alive(KEY.alive, 0.0)))
@@ -621,6 +622,8 @@ def test_a_repeated_start_takes_effect_once_and_a_dead_process_holds_no_licence(
     again = served.ask(START, replace(wanted, restart=1), SlaveStarted)
     assert again != started
     assert not psutil.pid_exists(started.pid)
+    left = {path.name for path in served.scratch.iterdir()}
+    assert left == {again.instance, f"wheel.{again.instance}.log"}
     with pytest.raises(SlaveBusyError, match="another such slave"):
         served.ask(START, wanted, SlaveStarted)
     started = again
