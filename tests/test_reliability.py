@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from master_node import Result
+from tests.fault_points import router, run_point
 from tests.test_processes import (
     BOUND,
     FOREVER,
@@ -269,3 +270,23 @@ def test_a_model_with_another_hash_is_refused(
             assert f"[slaves.wheel] sha256 = '{given}'" in last
             assert right in last
             assert not (out / "results.csv").exists()
+
+
+# ---- Drawn points -------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="uses signals and /proc")
+def test_a_process_that_is_killed_stopped_or_cut_off_at_a_drawn_point(
+    tmp_path: Path, fmu_dir: Path
+) -> None:
+    """One point of each kind; ``python -m benchmarks fault_points`` goes through 50 of them."""
+    with router() as shared:
+        points = []
+        for number in (13, 26, 39):
+            (tmp_path / str(number)).mkdir()
+            points.append(run_point(number, fmu_dir, tmp_path / str(number), shared))
+    assert [str(point.fault) for point in points] == [
+        "kill worker of wheel",
+        "stop node of wheel",
+        "cut router",
+    ]
