@@ -965,6 +965,38 @@ def test_a_slave_that_is_lost_is_started_again_elsewhere_if_need_be(  # noqa: PL
     assert slave_processes(agents["b"]) == {}
 
 
+def test_an_agent_that_stops_while_it_is_asked_to_start_a_slave(
+    start_agent: StartAgent, tmp_path: Path, fmu_dir: Path, endpoint: str, reference: bytes
+) -> None:
+    """SIGSTOP when the model is there: another agent starts the slave, and the run is the same.
+
+    When the first one goes on it is as good as new.
+    """
+    words = ("--label", "os=any", "--connect", endpoint, "--allow-upload")
+    (tmp_path / "empty").mkdir()
+    agents = {n: start_agent(n, *words, directory=tmp_path / "empty") for n in ("a", "b")}
+    file = system_file(
+        tmp_path,
+        {"model": fmu_dir / "chassis.fmu"},
+        {"model": fmu_dir / "wheel.fmu", "requires": {"os": "any"}},
+        bus=listening(endpoint, reconnect_time=0.5),
+    )
+    sent: list[str] = []
+
+    def stop(piece: Sent) -> None:
+        sent.append(piece.agent)
+        if piece.agent == "a" and piece.sent == piece.size:
+            agents["a"].send(signal.SIGSTOP)
+
+    run_system(load_system(file), tmp_path / "out", uploading=stop)
+    assert sent == ["a", "b"]
+    assert (tmp_path / "out" / "results.csv").read_bytes() == reference
+    agents["a"].send(signal.SIGCONT)
+    for agent in agents.values():
+        agent.send(signal.SIGTERM)
+        assert agent.wait() == 0, agent.text
+
+
 @pytest.mark.parametrize("victim", ["agent", "master"])
 def test_nothing_outlives_who_it_works_for(  # noqa: PLR0917  fixtures
     victim: str,
