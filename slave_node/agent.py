@@ -112,6 +112,7 @@ class _Run:
     slaves: dict[str, tuple[StartSlave, SlaveProcess]] = field(default_factory=dict)
     changes: int = 0
     ending: bool = False
+    look: threading.Timer | None = None
 
 
 _R = TypeVar("_R", bound=Record)
@@ -404,13 +405,16 @@ class Agent:
         self._look_after(master.run, 0.0 if ended else request.orphan_time)
 
     def _look_after(self, run: str, wait: float) -> None:
-        """See after ``wait`` seconds whether the master of ``run`` is there."""
+        """See after ``wait`` seconds whether the master of ``run`` is there; only the last look."""
         with self._lock:
             known = self._runs.get(run)
-            changes = 0 if known is None else known.changes
-        timer = threading.Timer(wait, self._end_orphans, (run, changes))
-        timer.daemon = True
-        timer.start()
+            if known is None:
+                return
+            if known.look is not None:
+                known.look.cancel()
+            known.look = threading.Timer(wait, self._end_orphans, (run, known.changes))
+            known.look.daemon = True
+            known.look.start()
 
     def _end_orphans(self, run: str, changes: int) -> None:
         with self._lock:
@@ -431,6 +435,8 @@ class Agent:
             if known is None:
                 return
             known.ending = True
+            if known.look is not None:
+                known.look.cancel()
         processes = [process for _, process in known.slaves.values()]
         end_all(processes)
         with self._lock:
