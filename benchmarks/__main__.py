@@ -4,6 +4,7 @@ import sys
 
 from benchmarks import (
     emulated_inputs,
+    fault_points,
     fault_schedules,
     fuzz,
     in_process,
@@ -58,7 +59,11 @@ TABLES = {
     ),
 }
 
-CHECKS = {"fuzz": fuzz.main, "fault_schedules": fault_schedules.main}
+CHECKS = {
+    "fault_points": fault_points.main,
+    "fault_schedules": fault_schedules.main,
+    "fuzz": fuzz.main,
+}
 """With their own options; they end with an error when something did not hold."""
 
 

@@ -203,6 +203,8 @@ class Agents:
         lines = [printable(line) for line in output.lines]
         error = end_error(name, output.exit_code, lines, remedy)
         error.cause = f"on {printable(agent.host)} (agent {agent.name}): {error.cause}"
+        if self._placed.get(name) is not placed:
+            return None  # it was started again meanwhile, and this was about the one before
         self._ended[name] = error
         return error
 

@@ -109,9 +109,11 @@ class Presence:
             ModelError: it ended because its model cannot be used.
         """
         deadline = self._clock.monotonic() + timeout
-        with self._changed:
-            while key not in self._alive:
-                error = starter.ended(key.name)
+        while True:
+            error = starter.ended(key.name)  # may ask another host: not while tokens are told of
+            with self._changed:
+                if key in self._alive:
+                    return
                 if error is not None:
                     raise error
                 if self._clock.monotonic() > deadline:

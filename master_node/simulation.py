@@ -30,6 +30,7 @@ from master_node.results import (
     SelectedResults,
     SelectionMemory,
     check_variables,
+    exclusive,
 )
 from master_node.resumption import RunMode, can_be_saved, check_models, reopened, saved_system
 from master_node.slave_group import SlaveGroup
@@ -120,16 +121,17 @@ def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None
         observers: are told of everything that happens from there on.
 
     Raises:
-        ResultsError: there is no checkpoint, or a file cannot be read.
+        ResultsError: there is no checkpoint, a file cannot be read, or another run writes there.
         ConfigurationError: a model or a table is not the one with which the run began.
         DoublestepError: as `simulate`.
     """
     directory = Path(directory)
     store = CheckpointStore(directory)
-    saved, checkpoint = store.load()
-    resumption = Resumption(saved, store, Resumed.of(checkpoint))
-    with reopened(saved) as (system, mode):
-        _run(system, directory, mode, observers, resumption=resumption)
+    with exclusive(directory):
+        saved, checkpoint = store.load()
+        resumption = Resumption(saved, store, Resumed.of(checkpoint))
+        with reopened(saved) as (system, mode):
+            _run(system, directory, mode, observers, resumption=resumption)
 
 
 @dataclass(frozen=True)
@@ -164,6 +166,8 @@ def _run(
     if directory is not None:
         ResultsWriter(directory, settings).prepare()
     with ExitStack() as stack:
+        if directory is not None and resumption is None:
+            stack.enter_context(exclusive(directory))
         traces = [] if trace is None else [stack.enter_context(closing(TraceWriter(trace)))]
         slaves = stack.enter_context(_slaves(system, directory, mode, uploading))
         if resumption is not None:

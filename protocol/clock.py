@@ -58,6 +58,14 @@ class Task(Protocol):
         ...
 
 
+class Timer(Protocol):
+    """What is used of `threading.Timer`."""
+
+    def cancel(self) -> None:
+        """Nothing happens any more, unless it has happened."""
+        ...
+
+
 class Clock(Protocol):
     """Time, and what waits for it. All methods may be called from any thread."""
 
@@ -81,7 +89,7 @@ class Clock(Protocol):
         """Run ``action`` beside all else from now on, unless the process has ended."""
         ...
 
-    def later(self, seconds: float, action: Callable[[], None]) -> None:
+    def later(self, seconds: float, action: Callable[[], None]) -> Timer:
         """Run ``action`` after ``seconds`` beside all else, unless the process has ended."""
         ...
 
@@ -111,11 +119,12 @@ class SystemClock:
         thread.start()
         return thread
 
-    def later(self, seconds: float, action: Callable[[], None]) -> None:
+    def later(self, seconds: float, action: Callable[[], None]) -> Timer:
         """See `Clock`."""
         timer = threading.Timer(seconds, action)
         timer.daemon = True
         timer.start()
+        return timer
 
 
 SYSTEM_CLOCK = SystemClock()

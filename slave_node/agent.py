@@ -13,6 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from shutil import rmtree
@@ -111,6 +112,7 @@ class _Run:
     slaves: dict[str, tuple[StartSlave, SlaveProcess]] = field(default_factory=dict)
     changes: int = 0
     ending: bool = False
+    look: threading.Timer | None = None
 
 
 _R = TypeVar("_R", bound=Record)
@@ -261,6 +263,7 @@ class Agent:
                 raise SlaveBusyError(f"run {request.run} has ended, or has another such slave")
             if started is not None:
                 end_all([started[1]], at_once=True)
+                self._forget(started[1])
             self._check(request)
             base, model = self._model(request.model)
             process = self._process(model, base, request.slave, request.run)
@@ -402,13 +405,16 @@ class Agent:
         self._look_after(master.run, 0.0 if ended else request.orphan_time)
 
     def _look_after(self, run: str, wait: float) -> None:
-        """See after ``wait`` seconds whether the master of ``run`` is there."""
+        """See after ``wait`` seconds whether the master of ``run`` is there; only the last look."""
         with self._lock:
             known = self._runs.get(run)
-            changes = 0 if known is None else known.changes
-        timer = threading.Timer(wait, self._end_orphans, (run, changes))
-        timer.daemon = True
-        timer.start()
+            if known is None:
+                return
+            if known.look is not None:
+                known.look.cancel()
+            known.look = threading.Timer(wait, self._end_orphans, (run, known.changes))
+            known.look.daemon = True
+            known.look.start()
 
     def _end_orphans(self, run: str, changes: int) -> None:
         with self._lock:
@@ -429,12 +435,19 @@ class Agent:
             if known is None:
                 return
             known.ending = True
+            if known.look is not None:
+                known.look.cancel()
         processes = [process for _, process in known.slaves.values()]
         end_all(processes)
         with self._lock:
             self._runs.pop(run, None)
         for process in processes:
             log.info("ended %s of run %s", process.key.name, run)
-            if self._surroundings.logs is None:
-                process.log.unlink(missing_ok=True)
-            rmtree(self._surroundings.scratch / process.key.instance, ignore_errors=True)
+            self._forget(process)
+
+    def _forget(self, process: SlaveProcess) -> None:
+        """Remove what a process that has ended leaves behind."""
+        if self._surroundings.logs is None:
+            with suppress(OSError):
+                process.log.unlink()
+        rmtree(self._surroundings.scratch / process.key.instance, ignore_errors=True)

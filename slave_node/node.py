@@ -16,7 +16,7 @@ from datetime import datetime
 from protocol.administration import DEFAULT_ORPHAN_TIME, Claim, SlaveStatus
 from protocol.bus import Bus
 from protocol.calls import CALLS, Call, Reply, Reset
-from protocol.clock import SYSTEM_CLOCK, Clock
+from protocol.clock import SYSTEM_CLOCK, Clock, Timer
 from protocol.codec import (
     PROTOCOL_VERSION,
     decode_map,
@@ -90,6 +90,8 @@ class SlaveNode:
         self._changes_of_master = 0
         self._clock = clock
         self._running = clock.lock()
+        self._looking = clock.lock()
+        self._look: Timer | None = None
         self._worker_alive = True
         self._since = time.time()
 
@@ -276,9 +278,15 @@ class SlaveNode:
         self._look_after(self._claims.epoch, 0.0 if ended else holder.orphan_time)
 
     def _look_after(self, epoch: int, wait: float) -> None:
-        """See after ``wait`` seconds whether the master of ``epoch`` is there."""
-        changes = self._changes_of_master
-        self._clock.later(wait, lambda: self._reset_orphan(epoch, changes))
+        """See after ``wait`` seconds whether the master of ``epoch`` is there.
+
+        One look is enough, the last: claims without number must not make timers without number.
+        """
+        with self._looking:
+            if self._look is not None:
+                self._look.cancel()
+            changes = self._changes_of_master
+            self._look = self._clock.later(wait, lambda: self._reset_orphan(epoch, changes))
 
     def _reset_orphan(self, epoch: int, changes: int) -> None:
         """Give a slave back whose master is gone; a step under way is for nobody any more."""

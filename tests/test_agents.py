@@ -498,12 +498,13 @@ class Served:
     """An agent on a bus within this process; processes that it starts are real."""
 
     def __init__(self, tmp_path: Path, offer: Offer) -> None:
-        (tmp_path / "slaves").mkdir()
+        self.scratch = tmp_path / "slaves"
+        self.scratch.mkdir()
         self.bus = InProcessBus()
         self._ending = threading.Event()
         # Nobody listens there: the slaves wait for a router until they are ended.
         connection = ["--connect", "tcp/127.0.0.1:1", "--mode", "client"]
-        self.agent = Agent(self.bus, KEY, offer, Surroundings(connection, tmp_path / "slaves"))
+        self.agent = Agent(self.bus, KEY, offer, Surroundings(connection, self.scratch))
         self._thread = threading.Thread(target=self.agent.serve, args=(self._ending,))
         self._thread.start()
         wait_until(lambda: bool(self.bus.alive(KEY.alive, 0.0)))
@@ -621,6 +622,8 @@ def test_a_repeated_start_takes_effect_once_and_a_dead_process_holds_no_licence(
     again = served.ask(START, replace(wanted, restart=1), SlaveStarted)
     assert again != started
     assert not psutil.pid_exists(started.pid)
+    left = {path.name for path in served.scratch.iterdir()}
+    assert left == {again.instance, f"wheel.{again.instance}.log"}
     with pytest.raises(SlaveBusyError, match="another such slave"):
         served.ask(START, wanted, SlaveStarted)
     started = again
@@ -960,6 +963,38 @@ def test_a_slave_that_is_lost_is_started_again_elsewhere_if_need_be(  # noqa: PL
     for name in ("results.csv", "steps.csv"):
         assert (out / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
     assert slave_processes(agents["b"]) == {}
+
+
+def test_an_agent_that_stops_while_it_is_asked_to_start_a_slave(
+    start_agent: StartAgent, tmp_path: Path, fmu_dir: Path, endpoint: str, reference: bytes
+) -> None:
+    """SIGSTOP when the model is there: another agent starts the slave, and the run is the same.
+
+    When the first one goes on it is as good as new.
+    """
+    words = ("--label", "os=any", "--connect", endpoint, "--allow-upload")
+    (tmp_path / "empty").mkdir()
+    agents = {n: start_agent(n, *words, directory=tmp_path / "empty") for n in ("a", "b")}
+    file = system_file(
+        tmp_path,
+        {"model": fmu_dir / "chassis.fmu"},
+        {"model": fmu_dir / "wheel.fmu", "requires": {"os": "any"}},
+        bus=listening(endpoint, reconnect_time=0.5),
+    )
+    sent: list[str] = []
+
+    def stop(piece: Sent) -> None:
+        sent.append(piece.agent)
+        if piece.agent == "a" and piece.sent == piece.size:
+            agents["a"].send(signal.SIGSTOP)
+
+    run_system(load_system(file), tmp_path / "out", uploading=stop)
+    assert sent == ["a", "b"]
+    assert (tmp_path / "out" / "results.csv").read_bytes() == reference
+    agents["a"].send(signal.SIGCONT)
+    for agent in agents.values():
+        agent.send(signal.SIGTERM)
+        assert agent.wait() == 0, agent.text
 
 
 @pytest.mark.parametrize("victim", ["agent", "master"])

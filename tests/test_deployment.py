@@ -40,6 +40,10 @@ SERVICES = {name: s for name, s in ALL_SERVICES.items() if "profiles" not in s}
 """Those that ``up`` starts."""
 
 
+CLUSTER = (*SERVICES, "agent")
+"""What runs in pods."""
+
+
 def documents() -> list[dict[str, Any]]:
     """All objects of the manifests."""
     return [d for path in MANIFESTS for d in yaml.safe_load_all(path.read_text(encoding="utf-8"))]
@@ -250,12 +254,16 @@ def containers_of_compose() -> dict[str, tuple[list[str], list[str]]]:
 
 def containers_of_kubernetes() -> dict[str, tuple[list[str], list[str]]]:
     """The same, out of the manifests."""
-    found = {}
-    for name in SERVICES:
-        (container,) = pods()[name]["containers"]
-        probe = container.get("livenessProbe", {}).get("exec", {}).get("command", [])
-        found[name] = (container["command"] + container["args"], probe)
-    return found
+    return {name: container_of_pod(name) for name in SERVICES}
+
+
+def container_of_pod(name: str) -> tuple[list[str], list[str]]:
+    """Command and health check of what runs in a pod; a shell is seen through."""
+    (container,) = pods()[name]["containers"]
+    probe = container.get("livenessProbe", {}).get("exec", {}).get("command", [])
+    if probe[:2] == ["sh", "-c"]:
+        probe = shlex.split(probe[2].removeprefix("exec "))
+    return container["command"] + container["args"], probe
 
 
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
@@ -282,22 +290,43 @@ def test_the_commands_of_the_containers_simulate_the_quarter_car(
     assert result.outputs.tobytes() == known.outputs.tobytes()
 
 
+def agent_of_compose() -> tuple[list[str], list[str]]:
+    """Command and health check of the agent."""
+    service = ALL_SERVICES["agent"]
+    return service["command"], service["healthcheck"]["test"][1:]
+
+
+def agent_of_kubernetes() -> tuple[list[str], list[str]]:
+    """The same of the first pod; its name is that of its host."""
+    command, health = container_of_pod("agent")
+    assert "--name" not in command
+    assert "$HOSTNAME" in health
+    name = f"{pods()['agent']['containers'][0]['name']}-0"
+    return [*command, "--name", name], [name if w == "$HOSTNAME" else w for w in health]
+
+
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
 @pytest.mark.usefixtures("no_process_left")
-def test_the_agent_of_the_compose_file_starts_slaves(processes: Processes, tmp_path: Path) -> None:
+@pytest.mark.parametrize("agent", [agent_of_compose, agent_of_kubernetes])
+def test_the_agent_of_the_containers_starts_slaves(
+    processes: Processes, tmp_path: Path, agent: Any
+) -> None:
     """Router and agent, and a master that names the agent: the results of a plain run."""
-    for name in ("router", "agent"):
-        processes.start(ALL_SERVICES[name]["command"])
-        processes.wait_healthy(ALL_SERVICES[name]["healthcheck"]["test"][1:])
+    router = ALL_SERVICES["router"]
+    command, health = agent()
+    for words, check in ((router["command"], router["healthcheck"]["test"][1:]), (command, health)):
+        processes.start(words)
+        processes.wait_healthy(check)
+    name = command[command.index("--name") + 1]
     file = tmp_path / "models" / "displacement.toml"
     known = simulate(load_system(file), in_process=True)
     for model in ("chassis.fmu", "wheel.fmu"):
         text = file.read_text(encoding="utf-8")
-        file.write_text(text.replace(f'"{model}"', f'"{model}"\nhost = "agent"'), encoding="utf-8")
-    command = [word for word in SERVICES["master"]["command"] if word != "--no-launch"]
-    assert processes.run(command) == 0
+        file.write_text(text.replace(f'"{model}"', f'"{model}"\nhost = "{name}"'), encoding="utf-8")
+    run = [word for word in SERVICES["master"]["command"] if word != "--no-launch"]
+    assert processes.run(run) == 0
     result = Result.load(tmp_path / "results")
-    assert result.summary["settings"]["slaves"]["wheel"]["host"] == "agent"
+    assert result.summary["settings"]["slaves"]["wheel"]["host"] == name
     assert result.time.tobytes() == known.time.tobytes()
     assert result.outputs.tobytes() == known.outputs.tobytes()
 
@@ -344,8 +373,8 @@ def test_the_manifests_belong_together() -> None:
         wanted = service["spec"]["selector"].items()
         assert any(wanted <= given.items() for given in labels)
     assert {d["spec"]["serviceName"] for d in found if d["kind"] == "StatefulSet"} <= set(services)
-    assert set(pods()) == set(SERVICES)
-    for command, health in containers_of_kubernetes().values():
+    assert set(pods()) == set(CLUSTER)
+    for command, health in map(container_of_pod, CLUSTER):
         check_command(command)
         assert set(endpoints(command)) <= {*services, "0.0.0.0"}
         if health:
@@ -353,7 +382,7 @@ def test_the_manifests_belong_together() -> None:
             assert set(endpoints(health)) <= {*services, "127.0.0.1"}
 
 
-@pytest.mark.parametrize("name", SERVICES)
+@pytest.mark.parametrize("name", CLUSTER)
 def test_a_pod_keeps_to_the_restricted_standard(name: str) -> None:
     """That of the Pod Security Standards, and more: read-only, bounded, no token of the cluster."""
     pod = pods()[name]
@@ -376,7 +405,7 @@ def test_a_pod_keeps_to_the_restricted_standard(name: str) -> None:
 
 
 def test_only_the_router_can_be_reached() -> None:
-    """Nothing by default; then slaves and masters to the router's port, and names for all."""
+    """Nothing by default; then all others to the router's port, and names for all."""
     policies = {
         d["metadata"]["name"]: d["spec"] for d in documents() if d["kind"] == "NetworkPolicy"
     }
@@ -391,6 +420,13 @@ def test_only_the_router_can_be_reached() -> None:
     assert [rule["ports"] for spec in ingress for rule in spec["ingress"]] == [
         [{"protocol": "TCP", "port": 7447}]
     ]
+    components = {
+        pod["metadata"]["labels"]["app.kubernetes.io/component"]
+        for pod in (d["spec"]["template"] for d in documents() if "template" in d.get("spec", {}))
+    }
+    (egress,) = [spec for spec in policies.values() if "matchExpressions" in spec["podSelector"]]
+    (expression,) = egress["podSelector"]["matchExpressions"]
+    assert {*expression["values"], "router"} == components
 
 
 # ---- systemd ------------------------------------------------------------------------------------
@@ -430,8 +466,12 @@ def unit(path: Path) -> dict[str, dict[str, list[str]]]:
 
 def environment(path: Path) -> dict[str, str]:
     """What a unit and its file of settings put into the environment."""
-    values = dict(v.split("=", 1) for v in unit(path)["Service"]["Environment"])
-    name = "router.env" if "router" in path.name else "wheel.env"
+    service = unit(path)["Service"]
+    values = dict(v.split("=", 1) for v in service["Environment"])
+    if "CacheDirectory" in service:
+        values["CACHE_DIRECTORY"] = f"/var/cache/{service['CacheDirectory'][-1]}"
+    (file,) = service["EnvironmentFile"]
+    name = Path(file.removeprefix("-").replace("%i", "wheel")).name
     parser = configparser.RawConfigParser(delimiters="=")
     parser.optionxform = str  # type: ignore[assignment,method-assign]
     parser.read_string("[x]\n" + (path.parent / name).read_text(encoding="utf-8"))

@@ -202,6 +202,27 @@ def test_a_slave_that_is_killed_again_and_again(tmp_path: Path) -> None:
     assert 0.097 < last <= info.value.time
 
 
+@pytest.mark.parametrize("what", ["kill worker", "kill node"])
+def test_a_slave_that_is_lost_in_its_initialization(
+    what: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It was ready, and its worker or its node is killed before T_0: started again, once."""
+    undisturbed = files(car(tmp_path / "a", FEW_STEPS), tmp_path / "a", in_process=True)
+    caplog.clear()
+    system = car(tmp_path / "b", FEW_STEPS, traps=f"-1.0 {what}")
+    assert files(system, tmp_path / "b") == undisturbed
+    (told,) = warnings(caplog)
+    assert re.match(r"chassis: .* (SIGKILL|signal 9).*; started again and restored", told), told
+
+
+def test_a_slave_that_dies_in_every_initialization(tmp_path: Path) -> None:
+    """Exit code 4 at once, with slave, call and signal: no smaller step could help."""
+    system = car(tmp_path, FEW_STEPS, always=-2.0, what="crash")
+    with pytest.raises(SlaveCrashedError, match=r"^chassis: .*initialize.* SIGSEGV") as info:
+        simulate(system, output=tmp_path / "out")
+    assert info.value.exit_code == 4
+
+
 def test_without_recovery_it_ends_the_run(tmp_path: Path) -> None:
     """``recovery = "off"``: exit code 3 at the first time."""
     system = car(tmp_path, SMALL_STEPS + 'recovery = "off"\n', traps="0.1 kill node")

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from master_node import Result
+from tests.fault_points import router, run_point
 from tests.test_processes import (
     BOUND,
     FOREVER,
@@ -162,10 +163,18 @@ def test_a_faulty_fmu_ends_the_run_and_nothing_else(  # noqa: PLR0917
 
 
 def test_a_full_disk_ends_the_run_with_readable_results(start: Start, tmp_path: Path) -> None:
-    """Exit code 7 naming the file; what was written before is whole. The limit is the system's."""
-    file = system_file(tmp_path, simulation=FOREVER)
+    """Exit code 7 naming the file; what was written before is whole. The limit is the system's.
+
+    When there is room again, ``resume`` goes on to the bytes of a run that always had room.
+    """
+    file = system_file(
+        tmp_path,
+        simulation="stop_time = 4.0\nlargest_step_size = 1e-3\ncheckpoint_interval = 0.1\n",
+    )
+    expected = in_process_files(start, file, tmp_path / "undisturbed")
+    limit = len(expected[0]) // 2
     code = (
-        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000));"
+        f"import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}));"
         f"sys.argv = ['master-node', 'run', {str(file)!r}, '--in-process', '--no-plot',"
         f" '--output', {str(tmp_path / 'out')!r}];"
         "from master_node.cli import main; main()"
@@ -179,6 +188,24 @@ def test_a_full_disk_ends_the_run_with_readable_results(start: Start, tmp_path: 
     result = Result.load(tmp_path / "out")
     assert len(result.time) > 100
     assert result.summary["outcome"] == "failed"
+    again = start("master_node", "resume", tmp_path / "out", "--no-plot")
+    assert again.wait() == 0, again.text
+    assert files_of(tmp_path / "out") == expected
+
+
+def test_a_second_run_into_one_directory_is_refused(start: Start, tmp_path: Path) -> None:
+    """Exit code 7, of ``resume`` too; the first run goes on and loses nothing."""
+    file, out = system_file(tmp_path, simulation=FOREVER), tmp_path / "out"
+    options = ("--in-process", "--no-plot", "--output", out)
+    first = start("master_node", "run", file, *options)
+    wait_until(lambda: has_stepped(out))
+    for words in (("run", file, *options), ("resume", out)):
+        second = start("master_node", *words)
+        assert second.wait() == 7
+        assert f"another run is writing into {out}; wait for its end" in second.text
+    first.send(signal.SIGINT)
+    assert first.wait() == 130
+    assert_summary(out, "interrupted")
 
 
 JUMPING = """
@@ -269,3 +296,23 @@ def test_a_model_with_another_hash_is_refused(
             assert f"[slaves.wheel] sha256 = '{given}'" in last
             assert right in last
             assert not (out / "results.csv").exists()
+
+
+# ---- Drawn points -------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="uses signals and /proc")
+def test_a_process_that_is_killed_stopped_or_cut_off_at_a_drawn_point(
+    tmp_path: Path, fmu_dir: Path
+) -> None:
+    """One point of each kind; ``python -m benchmarks fault_points`` goes through 50 of them."""
+    with router() as shared:
+        points = []
+        for number in (13, 26, 39):
+            (tmp_path / str(number)).mkdir()
+            points.append(run_point(number, fmu_dir, tmp_path / str(number), shared))
+    assert [str(point.fault) for point in points] == [
+        "kill worker of wheel",
+        "stop node of wheel",
+        "cut router",
+    ]

@@ -44,7 +44,8 @@ class Trapped(_Chassis):
     """A chassis with ``traps``, such as ``"0.1 kill worker, 0.2 crash"``: time and accident.
 
     Each happens once, at the first evaluation at that time or later: a file in ``folder`` tells.
-    What happens from the time ``always`` on happens again and again.
+    What happens from the time ``always`` on happens again and again. Negative times are those of
+    the initialization.
     """
 
     parameters = (
@@ -55,8 +56,17 @@ class Trapped(_Chassis):
         Variable("what", type=VariableType.STRING, start="crash"),
     )
 
+    def prepare(self) -> None:
+        """As the chassis', if it lives to see the end of it."""
+        super().prepare()
+        self._meet(-1.0)
+
     def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
         """The chassis' equations, if it lives to see them."""
+        self._meet(t)
+        return list(super().derivatives(t, x, u))
+
+    def _meet(self, t: float) -> None:
         for number, trap in enumerate(filter(None, self.traps.split(","))):
             time, _, what = trap.strip().partition(" ")
             if t >= float(time):
@@ -68,4 +78,3 @@ class Trapped(_Chassis):
                 sleep(30.0)  # until it has happened
         if t >= self.always:
             _ACCIDENTS[self.what]()
-        return list(super().derivatives(t, x, u))

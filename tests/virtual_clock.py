@@ -25,6 +25,16 @@ class DeadlockError(AssertionError):
     """Everybody waits, and nothing will ever happen: somebody waits without a bound."""
 
 
+class VirtualTimer:
+    """Something that will happen unless it is cancelled."""
+
+    is_cancelled = False
+
+    def cancel(self) -> None:
+        """See `protocol.clock.Timer`."""
+        self.is_cancelled = True
+
+
 class VirtualClock:
     """Implements `protocol.clock.Clock`. Only tasks, that is what `run` runs, may wait."""
 
@@ -52,9 +62,11 @@ class VirtualClock:
         self.at(self._now, made.switch)
         return task
 
-    def later(self, seconds: float, action: Callable[[], None]) -> None:
+    def later(self, seconds: float, action: Callable[[], None]) -> VirtualTimer:
         """See `Clock`."""
-        self.at(self._now + seconds, lambda: self.start(action))
+        timer = VirtualTimer()
+        self.at(self._now + seconds, lambda: timer.is_cancelled or self.start(action))
+        return timer
 
     def sleep(self, seconds: float) -> None:
         """Wait."""

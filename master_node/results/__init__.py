@@ -18,6 +18,7 @@ In the CSV files numbers are written with ``repr``, the shortest text that reads
 bits: equal numbers give equal files, byte for byte.
 """
 
+from master_node.results.exclusive import exclusive
 from master_node.results.files import (
     ARROW_FILE,
     MAT_FILE,
@@ -50,5 +51,6 @@ __all__ = [
     "SelectionMemory",
     "check_variables",
     "chosen",
+    "exclusive",
     "summarize",
 ]
