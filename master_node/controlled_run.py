@@ -104,7 +104,7 @@ class ControlledRun:
         self._estimator = estimator
         self._limits = step_size_limits(context.system)
         external = coupled.external
-        self._crossings = crossings(context.system, self._limits, external.jumps)
+        self._crossings = crossings(context.system, self._limits, coupled.jumps)
         # Where H is a multiple of something a double step cannot end wherever a kink is.
         kinks = external.kinks if self._limits.lead_everywhere else ()
         self._landing_points = LandingPoints(kinks, self._limits.smallest)
@@ -502,13 +502,13 @@ class ControlledRun:
         d_middle, d_end = step.discrete
         changed = self._coupled.discrete.changed
         step_size, unchanged = 0.5 * times.first, position.unchanged
-        name = changed(d_middle, d_end)
+        name = changed(d_middle, d_end, times.middle, times.end)
         if name:
             landing = self._limits.landing(self._start, times.begin, times.middle, target)
             if landing is not None:
                 step_size, unchanged = times.second, landing
         else:
-            name = changed(position.outputs.d, d_middle)
+            name = changed(position.outputs.d, d_middle, times.begin, times.middle)
             if not name or error.norm <= 1.0:
                 return None
         step_size = self._controller.bounded(step_size)
@@ -520,7 +520,9 @@ class ControlledRun:
             return "event"
         d_middle, d_end = step.discrete
         changed = self._coupled.discrete.changed
-        name = changed(position.outputs.d, d_middle) or changed(d_middle, d_end)
+        begin, middle, end, _, _ = step.times
+        name = changed(position.outputs.d, d_middle, begin, middle)
+        name = name or changed(d_middle, d_end, middle, end)
         return f"{name} changes" if name else ""
 
     # --- what observers and counters are told ---------------------------------------------------

@@ -141,7 +141,7 @@ class DoubleStepper:
     ) -> DoubleStep:
         begin, middle, end, first, second = times
         discrete = self._coupled.discrete
-        held = discrete.held(outputs.y[0], outputs.d)
+        held = discrete.held(outputs.y[0], outputs.d, begin)
         external = self._external.over(begin, middle)
         external_second = self._external.over(middle, end)
         external_long = self._external.over(begin, end)
@@ -192,7 +192,7 @@ class DoubleStepper:
             before_second,
             inputs_of("second", pushed, end),
             external_second,
-            discrete.held(y_middle[0], d_middle),
+            discrete.held(y_middle[0], d_middle, middle),
             DoStep(middle, second, False),
             *self._solution,
         )

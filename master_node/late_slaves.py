@@ -66,7 +66,7 @@ class LateSlaves:
         start, middle, end, first, second = step.times
         discrete = self._coupled.discrete
         d_middle, d_end = step.discrete
-        held = discrete.held(begin.y[0], begin.d)
+        held = discrete.held(begin.y[0], begin.d, start)
         signal = self._scheme.extrapolation.signal
         pushed = history.pushed(middle, self._coupled.inputs_of(step.middle))
         to_middle = self._piece(
@@ -84,11 +84,11 @@ class LateSlaves:
                 pushed = history.pushed(middle, self._coupled.inputs_of(y_middle))
                 inputs = signal(pushed.pushed(end, u_end), step.polynomials, 1).derivatives
                 d_middle = discrete.filled(at_middle.d, d_middle)
-                held = discrete.held(y_middle[0], d_middle)
+                held = discrete.held(y_middle[0], d_middle, middle)
                 (late,) = self._requests.take([self._piece(inputs, to_end, held, end)])
             else:
                 inputs = signal(pushed.pushed(end, u_end), step.polynomials, 1).derivatives
-                held = discrete.held(step.middle[0], d_middle)
+                held = discrete.held(step.middle[0], d_middle, middle)
                 at_middle, late = self._requests.take(
                     [to_middle, self._piece(inputs, to_end, held, end)]
                 )

@@ -54,7 +54,7 @@ class SingleStepper:
         scheme = self._scheme
         inputs = partial(self._inputs, history, polynomials, end)
         external = self._coupled.external.over(step.communication_point, end)
-        held = self._coupled.discrete.held(begin.y[0], begin.d)
+        held = self._coupled.discrete.held(begin.y[0], begin.d, step.communication_point)
         piece = Piece((), inputs, external, held, step, scheme.get_outputs, scheme.output_rows)
         (outputs,) = self._requests.take([piece])
         return outputs

@@ -88,6 +88,9 @@ def crossings(
         following = bisect_right(begins, crossing.begin)
         free = max([reached, *(c.end for c, _ in declared[:following][-1:])])
         ahead = min([stop, *begins[following : following + 1]])
+        if jump.is_held and limits.quantum is None and crossing.begin < free < jump.time:
+            # Told late by two of the smallest H at most; a later one could be of any size.
+            crossing = DoubleStepTimes.from_step_size(free, limits.smallest)
         is_between = free <= crossing.begin and crossing.end <= ahead and crossing.end < stop
         if is_between and all(
             limits.leads(start, *way) for way in ((free, crossing.begin), (crossing.end, ahead))
