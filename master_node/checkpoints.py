@@ -40,6 +40,7 @@ _COUNTERS = (
     "rejected_double_steps",
     "discontinuities",
     "double_steps_at_discontinuities",
+    "changes_at_smallest_step_size",
     "steps_above_tolerance",
     "time",
     "smallest_step_size",

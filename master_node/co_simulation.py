@@ -94,7 +94,7 @@ def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:
     if settings.estimator != "none":
         return []
     start, stop, step_size = float(settings.start_time), settings.end, settings.step_size
-    inside = [jump for jump in coupled.external.jumps if start < jump.time < stop]
+    inside = [jump for jump in coupled.jumps if start < jump.time < stop]
     steps = np.array([(jump.time - start) / step_size for jump in inside])
     is_off = np.abs(steps - np.round(steps)) > 1e-9 * np.maximum(1.0, steps)
     if not is_off.any():
@@ -103,7 +103,8 @@ def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:
     return [
         f"{int(is_off.sum())} jumps of external inputs are not at communication points, the first "
         f"one is that of {first.name} at t={first.time!r} s: in a step over a jump the polynomial "
-        "has the right mean only; choose a step size that meets them, or an estimator"
+        "has the right mean only, and a discrete input its old value; choose a step size that "
+        "meets them, or an estimator"
     ]
 
 

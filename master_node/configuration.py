@@ -447,15 +447,18 @@ class InputRows:
 
     Attributes:
         times: [s].
-        values: at these times, of the same shape (n,).
+        values: at these times, of the same shape (n,); of a ``hold`` table for a discrete input
+            also booleans or texts.
     """
 
     def __init__(self, times: Any, values: Any) -> None:
         try:
             self.times = np.array(times, dtype=float)
-            self.values = np.array(values, dtype=float)
+            self.values = np.array(values)
         except (TypeError, ValueError):
-            raise ValueError("write two arrays of numbers, times and values") from None
+            raise ValueError("write two arrays, times and values") from None
+        if self.values.dtype.kind not in "fiubU":
+            raise ValueError("write two arrays, times and values: numbers, booleans or texts")
         if self.times.ndim != 1 or self.times.shape != self.values.shape:
             raise ValueError(
                 f"times of shape {self.times.shape} and values of shape {self.values.shape} are "
@@ -489,7 +492,7 @@ class InputSettings(_Table):
     time: StrictStr | None = None
     interpolation: Literal["linear", "hold", "spline"] = "linear"
     extrapolate: Literal["hold"] | None = None
-    function: StrictStr | Callable[[float], float] | None = None
+    function: StrictStr | Callable[[float], Any] | None = None
     breakpoints: tuple[Number, ...] = ()
     order: Literal[0, 1, 2, 3] = 3
 

@@ -104,15 +104,11 @@ class ControlledRun:
         self._estimator = estimator
         self._limits = step_size_limits(context.system)
         external = coupled.external
-        self._crossings = crossings(context.system, self._limits, external.jumps)
+        self._crossings = crossings(context.system, self._limits, coupled.jumps)
         # Where H is a multiple of something a double step cannot end wherever a kink is.
-        kinks = external.kinks if self._limits.quantum is None else ()
+        kinks = external.kinks if self._limits.lead_everywhere else ()
         self._landing_points = LandingPoints(kinks, self._limits.smallest)
-        self._searches_changes = (
-            settings.discontinuities
-            and coupled.discrete.holds_inputs
-            and self._limits.quantum is None
-        )
+        self._searches_changes = settings.discontinuities and coupled.discrete.holds_inputs
         self._stepper = self._make_stepper(context, estimator)
         self._control = self._make_control(context, estimator)
         self._defects = InputDefects(coupled, scheme, self._control)
@@ -269,7 +265,7 @@ class ControlledRun:
         polynomials = self._polynomials(position)
         step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
         if isinstance(step, FailedStep):
-            return self._after_failure(position, step, times, polynomials)
+            return self._after_failure(position, step, times, polynomials, target)
         error = self._control.judge(step)
         event = self._event(position, step)
         defects, jumps = None, False
@@ -282,15 +278,20 @@ class ControlledRun:
             )
             if jumps:
                 event = event or f"{self._defects.name(defects)} jumps"
-        if event and self._is_smallest(times):
-            return self._accept_jump(position, step, error, event)
+        searched = None
         if self._searches_changes:
-            searched = self._search_change(position, step, error)
-            if searched is not None:
-                return searched
+            searched = self._search_change(position, step, error, target)
+        if event and self._is_smallest(times, target):
+            self._statistics.changes_at_smallest_step_size += searched is not None
+            return self._accept_jump(position, step, error, event)
+        if searched is not None:
+            name, following = searched
+            self._statistics.double_steps_at_discontinuities += 1
+            self._tell_rejected(times, polynomials, error.norm, f"{name} changes")
+            return following
         if error.norm <= 1.0 and not jumps:
             return self._accept(position, step, error, defects)
-        return self._reject(position, step, error, defects)
+        return self._reject(position, step, error, defects, target)
 
     def _accept(
         self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
@@ -339,11 +340,16 @@ class ControlledRun:
         )
 
     def _reject(
-        self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
+        self,
+        position: Position,
+        step: DoubleStep,
+        error: StepError,
+        defects: Defects | None,
+        target: float,
     ) -> Position:
         times, bracket = step.times, position.bracket
         is_noticed = error.norm > 1.0 or not error.norm < _INF
-        if self._is_smallest(times) and is_noticed:
+        if is_noticed and self._is_smallest(times, target):
             raise self._stuck(error, times)
         reason = error.limiting_variable
         if not is_noticed and defects is not None:
@@ -371,6 +377,7 @@ class ControlledRun:
         failed: FailedStep,
         times: DoubleStepTimes,
         polynomials: Polynomials,
+        target: float,
     ) -> Position | str:
         if failed.status is StepStatus.TERMINATED:
             return f"{failed.slave} ended the simulation after t={times.begin!r} s"
@@ -382,7 +389,7 @@ class ControlledRun:
             if errors_in_a_row > 1:
                 raise error
         self._tell_rejected(times, polynomials, _INF, failed.reason)
-        if self._is_smallest(times):
+        if self._is_smallest(times, target):
             raise error or self._stuck_for(failed.reason, times)
         return replace(
             position,
@@ -411,8 +418,12 @@ class ControlledRun:
             )
         return replace(position, event=failed.time)
 
-    def _is_smallest(self, times: DoubleStepTimes) -> bool:
-        return times.first <= self._limits.smallest
+    def _is_smallest(self, times: DoubleStepTimes, target: float) -> bool:
+        """Whether no smaller H leads from T_n to ``target`` [s]."""
+        smallest = self._limits.smallest
+        if times.first <= smallest:
+            return True
+        return times.first <= self._limits.times(self._start, times.begin, smallest, target).first
 
     def _stuck(self, error: StepError, times: DoubleStepTimes) -> DoublestepError:
         reason = error.limiting_variable
@@ -441,7 +452,7 @@ class ControlledRun:
         polynomials = self._polynomials(position)
         step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
         if isinstance(step, FailedStep):
-            following = self._after_failure(position, step, times, polynomials)
+            following = self._after_failure(position, step, times, polynomials, times.end)
             assert isinstance(following, str)  # such a small step is not made smaller
             return following
         error = self._control.judge(step)
@@ -476,8 +487,8 @@ class ControlledRun:
         return self._with_initial_step_size(behind, position.step_size)
 
     def _search_change(
-        self, position: Position, step: DoubleStep, error: StepError
-    ) -> Position | None:
+        self, position: Position, step: DoubleStep, error: StepError, target: float
+    ) -> tuple[str, Position] | None:
         """Go back where a discrete output changes, until its delay is within the tolerance.
 
         A change in the first small step makes the second one other than the comparison solution, so
@@ -485,22 +496,23 @@ class ControlledRun:
         estimate: a double step must end before it, and the next one meets it in its first step.
 
         Returns:
-            What to try next; None: there is nothing to search.
+            The output, and what to try next if H can be smaller; None: there is nothing to search.
         """
         times = step.times
         d_middle, d_end = step.discrete
         changed = self._coupled.discrete.changed
-        name = changed(d_middle, d_end)
+        step_size, unchanged = 0.5 * times.first, position.unchanged
+        name = changed(d_middle, d_end, times.middle, times.end)
         if name:
-            following = replace(position, unchanged=times.middle, step_size=times.second)
+            landing = self._limits.landing(self._start, times.begin, times.middle, target)
+            if landing is not None:
+                step_size, unchanged = times.second, landing
         else:
-            name = changed(position.outputs.d, d_middle)
+            name = changed(position.outputs.d, d_middle, times.begin, times.middle)
             if not name or error.norm <= 1.0:
                 return None
-            following = replace(position, step_size=0.5 * times.first)
-        self._statistics.double_steps_at_discontinuities += 1
-        self._tell_rejected(times, step.polynomials, error.norm, f"{name} changes")
-        return replace(following, step_size=self._controller.bounded(following.step_size))
+        step_size = self._controller.bounded(step_size)
+        return name, replace(position, step_size=step_size, unchanged=unchanged)
 
     def _event(self, position: Position, step: DoubleStep) -> str:
         """What changed at once in a double step, in words; "" if nothing did."""
@@ -508,7 +520,9 @@ class ControlledRun:
             return "event"
         d_middle, d_end = step.discrete
         changed = self._coupled.discrete.changed
-        name = changed(position.outputs.d, d_middle) or changed(d_middle, d_end)
+        begin, middle, end, _, _ = step.times
+        name = changed(position.outputs.d, d_middle, begin, middle)
+        name = name or changed(d_middle, d_end, middle, end)
         return f"{name} changes" if name else ""
 
     # --- what observers and counters are told ---------------------------------------------------

@@ -77,7 +77,7 @@ class DefectRun:
         self._checkpoints = context.checkpoints
         self._resumed = context.resumed
         self._limits = step_size_limits(context.system)
-        self._crossings = crossings(context.system, self._limits, self._coupled.external.jumps)
+        self._crossings = crossings(context.system, self._limits, self._coupled.jumps)
         self._stepper = SingleStepper(context)
         self._coupling = CouplingDefects(context.coupled, scheme, SingleStep(scheme))
         self._ladder: tuple[InputPolynomial, ...] = ()
@@ -166,7 +166,9 @@ class DefectRun:
         following, polynomials, error = self._take(position, end, size)
         reached: Reached = (ReachedPoint(end, *following.outputs),)
         attempt = _attempt(position.time, size, polynomials, error)
-        changed = self._coupled.discrete.changed(position.outputs.d, following.outputs.d)
+        changed = self._coupled.discrete.changed(
+            position.outputs.d, following.outputs.d, position.time, end
+        )
         if changed or (error.has_jumped and self._settings.discontinuities):
             self._statistics.discontinuities += 1
             name = f"{changed} changes" if changed else f"{error.limiting_variable} jumps"

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from master_node.connections import ScalarConnection
+from master_node.discrete_inputs import DrivenInput
+from master_node.external_inputs import Jump
 from master_node.type_casts import Cast
 from master_node.units import Transformation
 from protocol.errors import SlaveError
@@ -82,7 +84,8 @@ class DiscreteCoupling:
         keys: slave and variable of each discrete output.
         types, units: of the discrete outputs.
         output_slices: for each slave where its discrete outputs are among all of them.
-        inputs: for each slave its discrete inputs, in order.
+        inputs: for each slave its discrete inputs that are connected, in order.
+        driven: for each slave those that change from outside, in order, behind the connected ones.
     """
 
     keys: tuple[tuple[str, str], ...]
@@ -90,6 +93,7 @@ class DiscreteCoupling:
     units: tuple[str, ...]
     output_slices: tuple[slice, ...]
     inputs: tuple[tuple[HeldInput, ...], ...]
+    driven: tuple[tuple[DrivenInput, ...], ...] = ()
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -103,8 +107,17 @@ class DiscreteCoupling:
 
     @cached_property
     def holds_inputs(self) -> bool:
-        """Whether any slave has discrete inputs that are connected."""
-        return any(self.inputs)
+        """Whether any slave has discrete inputs that are connected, or change from outside."""
+        return any(self.inputs) or any(self.driven)
+
+    @cached_property
+    def jumps(self) -> tuple[Jump, ...]:
+        """Known changes of inputs that are driven from outside, in order of time."""
+        return tuple(sorted({jump for each in self.driven for one in each for jump in one.jumps}))
+
+    @cached_property
+    def _searched(self) -> tuple[DrivenInput, ...]:
+        return tuple(one for each in self.driven for one in each if one.is_searched)
 
     @cached_property
     def _connected(self) -> tuple[int, ...]:
@@ -118,14 +131,25 @@ class DiscreteCoupling:
         Args:
             y: continuous outputs, shape (m,).
             d: discrete outputs.
-            time: of the outputs [s].
+            time: of both [s].
 
         Raises:
-            SlaveError: a mapping of a connection has no entry for a value.
+            SlaveError: a mapping of a connection has no entry for a value, or a function that
+                drives an input from outside failed.
         """
         if not self.holds_inputs:
             return ()
-        return tuple(tuple(held.value(y, d, time) for held in inputs) for inputs in self.inputs)
+        connected = (tuple(held.value(y, d, time) for held in inputs) for inputs in self.inputs)
+        if not any(self.driven):
+            return tuple(connected)
+        return tuple(
+            values + outside
+            for values, outside in zip(connected, self.from_outside(time), strict=True)
+        )
+
+    def from_outside(self, time: float) -> Held:
+        """For each slave the values of its inputs that are driven from outside, at a time [s]."""
+        return tuple(tuple(one.signal.at(time) for one in each) for each in self.driven)
 
     def filled(self, known: DiscreteValues, before: DiscreteValues) -> DiscreteValues:
         """Discrete outputs with those of ``before`` where nobody was asked."""
@@ -133,11 +157,25 @@ class DiscreteCoupling:
             return ()
         return tuple(b if k is None else k for k, b in zip(known, before, strict=True))
 
-    def changed(self, before: DiscreteValues, after: DiscreteValues) -> str:
-        """``slave.variable`` of a discrete output that has changed and feeds an input, or ""."""
+    def changed(
+        self, before: DiscreteValues, after: DiscreteValues, begin: float, end: float
+    ) -> str:
+        """``slave.variable`` of what has changed, or "".
+
+        That is a discrete output that feeds an input, or an input that a function drives.
+
+        Args:
+            before: discrete outputs at ``begin``.
+            after: discrete outputs at ``end``.
+            begin: when those before were read [s].
+            end: when those behind were read [s].
+        """
         for index in self._connected:
             if before[index] != after[index]:
                 return self.names[index]
+        for one in self._searched:
+            if one.signal.at(begin) != one.signal.at(end):
+                return one.name
         return ""
 
 
@@ -145,6 +183,7 @@ def couple_discrete(
     descriptions: Mapping[str, SlaveDescription],
     feeding: Sequence[Sequence[ScalarConnection]],
     continuous_outputs: Mapping[tuple[str, str], int],
+    driven: Sequence[Sequence[DrivenInput]],
 ) -> DiscreteCoupling:
     """Give every discrete output its index.
 
@@ -152,6 +191,7 @@ def couple_discrete(
         descriptions: of all slaves, in order.
         feeding: for each slave the connections of its discrete inputs, in order.
         continuous_outputs: indices of the continuous outputs by slave and variable.
+        driven: for each slave its inputs that change from outside, in order.
     """
     keys: list[tuple[str, str]] = []
     types: list[VariableType] = []
@@ -184,4 +224,5 @@ def couple_discrete(
             )
             for feeds in feeding
         ),
+        tuple(map(tuple, driven)),
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite, ulp
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class SignalFunction:
         order: highest degree of its polynomials.
     """
 
-    function: Callable[[float], float]
+    function: Callable[[float], Any]
     breakpoints: tuple[float, ...] = ()
     order: int = MAX_ORDER
 
@@ -103,10 +103,12 @@ class Jump(NamedTuple):
     Attributes:
         time: when [s].
         name: ``slave.variable``.
+        is_held: whether the input keeps its old value in a step over the jump.
     """
 
     time: float
     name: str
+    is_held: bool = False
 
 
 class ExternalInputs:
@@ -169,7 +171,7 @@ class ExternalInputs:
             self._function_columns, self._functions, strict=True
         ):
             inside = _INSIDE * ulp(abs(time))
-            values[column] = _value(one, signal, _off(points, time, inside))
+            values[column] = _value(one, signal, beside_breakpoint(points, time, inside))
         return values
 
     def over(self, begin: float, end: float) -> ExternalSignal:
@@ -223,16 +225,16 @@ def _sampled(
     """Values at both ends of a step from inside, mean and first moment less the first value."""
     inside = _INSIDE * ulp(max(abs(begin), abs(end)))
     inner = points[points.searchsorted(begin + inside) : points.searchsorted(end - inside)]
-    first = _value(one, signal, _off(points, begin, inside))
-    last = _value(one, signal, _off(points, end, -inside))
+    first = _value(one, signal, beside_breakpoint(points, begin, inside))
+    last = _value(one, signal, beside_breakpoint(points, end, -inside))
     quadrature = Quadrature.over(begin, inner, end)
     values = np.array([_value(one, signal, t) for t in quadrature.times.ravel().tolist()]) - first
     mean = float(quadrature.mean.ravel() @ values)
     return first, last, mean, float(quadrature.moment.ravel() @ values)
 
 
-def _off(points: FloatArray, time: float, inside: float) -> float:
-    """``time``, or where it is on a breakpoint a point on the side of ``inside`` [s]."""
+def beside_breakpoint(points: FloatArray, time: float, inside: float) -> float:
+    """``time`` [s], or where it is on a breakpoint a point on the side of ``inside`` [s]."""
     near = points.searchsorted(time - abs(inside))
     is_on = near < len(points) and points[near] <= time + abs(inside)
     return float(points[near]) + inside if is_on else time

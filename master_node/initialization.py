@@ -122,12 +122,12 @@ class _InitializationMode:
 
     def _iterate(self, outputs: Outputs) -> None:
         """Fixed-point iteration for an algebraic loop across slaves."""
-        coupled = self._coupled
+        coupled, discrete = self._coupled, self._coupled.discrete
 
         def again(y: FloatArray) -> FloatArray:
             nonlocal outputs
             outputs = self._round(
-                self._inputs(coupled.inputs_of(y), coupled.discrete.held(y, outputs.d, self._start))
+                self._inputs(coupled.inputs_of(y), discrete.held(y, outputs.d, self._start))
             )
             values: FloatArray = outputs.y[0]
             return values
@@ -175,7 +175,12 @@ class _InitializationMode:
                 return held.start
             return held.value(outputs.y[0], outputs.d, self._start)
 
-        return tuple(tuple(map(value, inputs)) for inputs in discrete.inputs)
+        return tuple(
+            (*map(value, inputs), *outside)
+            for inputs, outside in zip(
+                discrete.inputs, discrete.from_outside(self._start), strict=True
+            )
+        )
 
     def _round(self, programs: Sequence[Program]) -> Outputs:
         """Execute these calls and read all outputs."""

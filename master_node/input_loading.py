@@ -14,11 +14,14 @@ from collections.abc import Callable, Mapping
 from math import isfinite
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from master_node.configuration import InputRows, InputSettings, System
+from master_node.discrete_inputs import HoldRows
 from master_node.external_inputs import SignalFunction
 from master_node.numerics.input_tables import InputTableError, Table, make_table
 from protocol.errors import ConfigurationError
@@ -26,13 +29,13 @@ from protocol.names import nearest
 from protocol.signals import FloatArray
 from protocol.slave import StartValue
 
-Columns = Mapping[str, FloatArray]
-"""The columns of a file by name, in its order."""
+Columns = Mapping[str, NDArray[Any]]
+"""The columns of a file by name, in its order; texts out of a CSV file."""
 
 _READ = {".csv", ".npy", ".npz"}
 
 
-def load_signals(system: System) -> dict[str, StartValue | Table | SignalFunction]:
+def load_signals(system: System) -> dict[str, StartValue | Table | HoldRows | SignalFunction]:
     """What drives the inputs in ``[inputs]``, by ``slave.variable``.
 
     Loading a function runs the code of its module. Files are read once, whatever the number of
@@ -42,7 +45,7 @@ def load_signals(system: System) -> dict[str, StartValue | Table | SignalFunctio
         ConfigurationError: with the system's source and the input.
     """
     files: dict[Path, Columns] = {}
-    signals: dict[str, StartValue | Table | SignalFunction] = {}
+    signals: dict[str, StartValue | Table | HoldRows | SignalFunction] = {}
     for name, setting in system.inputs.items():
         try:
             if not isinstance(setting, InputSettings):
@@ -64,25 +67,53 @@ def load_signals(system: System) -> dict[str, StartValue | Table | SignalFunctio
 
 def _table(
     setting: InputSettings, table: str | InputRows, system: System, files: dict[Path, Columns]
-) -> Table:
-    times, values = (
-        (table.times, table.values)
-        if isinstance(table, InputRows)
-        else _rows(setting, system.base / table, files)
-    )
+) -> Table | HoldRows:
+    if isinstance(table, InputRows):
+        times, values, place, name = table.times, table.values, "", "value"
+    else:
+        place = f"{Path(table).name}: "
+        times, values, name = _rows(setting, system.base / table, files)
+    holds = setting.interpolation == "hold"
+    numbers = None if holds and not _are_numbers(values) else _numbers(place, name, values)
     span = (float(system.simulation.start_time), system.simulation.end)
-    return make_table(
+    made = make_table(
         times,
-        values,
+        np.zeros(len(times)) if numbers is None else numbers,
         setting.interpolation,
         span,
         extrapolates=setting.extrapolate is not None,
     )
+    return HoldRows(times, values, None if numbers is None else made) if holds else made
+
+
+def _are_numbers(column: NDArray[Any]) -> bool:
+    if column.dtype.kind == "U":
+        return all(map(_is_number, column.tolist()))
+    return column.dtype.kind != "b"
+
+
+def _numbers(place: str, name: str, column: NDArray[Any]) -> FloatArray:
+    """A column as numbers.
+
+    Raises:
+        ConfigurationError: a text is none, or these are truth values.
+    """
+    remedy = 'a table of a discrete input has interpolation = "hold"'
+    if column.dtype.kind == "b":
+        raise ConfigurationError(f"{place}{name} is no column of numbers", remedy=remedy)
+    if column.dtype.kind == "U":
+        for row, text in enumerate(column.tolist(), 1):
+            if not _is_number(text):
+                raise ConfigurationError(
+                    f"{place}row {row}: {name} = {text!r} is not a number", remedy=remedy
+                )
+    return column.astype(float)
 
 
 def _rows(
     setting: InputSettings, path: Path, files: dict[Path, Columns]
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, NDArray[Any], str]:
+    """Times, values, and the name of their column."""
     if path not in files:
         files[path] = _read(path)
     columns = files[path]
@@ -106,11 +137,11 @@ def _rows(
         raise ConfigurationError(
             f"{path.name}: {len(times)} times in {time!r} and {len(values)} values in {column!r}"
         )
-    return times, values
+    return _numbers(f"{path.name}: ", time, times), values, column
 
 
 def _read(path: Path) -> Columns:
-    """A file as columns of numbers.
+    """A file as columns.
 
     Raises:
         ConfigurationError: it is missing, or not what its suffix says.
@@ -144,13 +175,8 @@ def _read_csv(path: Path) -> Columns:
             raise ConfigurationError(
                 f"{path.name}: row {number} has {len(line)} values for {len(names)} columns"
             )
-        for name, text in zip(names, line, strict=True):
-            if not _is_number(text):
-                raise ConfigurationError(
-                    f"{path.name}: row {number}: {name} = {text!r} is not a number"
-                )
-    numbers = np.array(lines[1:], dtype=float).reshape(-1, len(names))
-    return dict(zip(names, np.ascontiguousarray(numbers.T), strict=True))
+    texts = np.array(lines[1:], dtype=np.str_).reshape(-1, len(names))
+    return dict(zip(names, texts.T, strict=True))
 
 
 def _is_number(text: str) -> bool:
@@ -166,7 +192,9 @@ def _read_numpy(path: Path) -> Columns:
         loaded = np.load(path, allow_pickle=False)
         arrays = {name: loaded[name] for name in loaded.files} if path.suffix == ".npz" else loaded
     except (ValueError, EOFError, AttributeError, BadZipFile) as error:
-        raise ConfigurationError(f"{path.name}: not a NumPy file of numbers") from error
+        raise ConfigurationError(
+            f"{path.name}: not a NumPy file of numbers, truth values or texts"
+        ) from error
     if isinstance(arrays, np.ndarray):
         if arrays.dtype.names is not None:
             arrays = {name: arrays[name] for name in arrays.dtype.names}
@@ -178,14 +206,14 @@ def _read_numpy(path: Path) -> Columns:
                 "columns, times and values"
             )
     for name, array in arrays.items():
-        if array.ndim != 1 or array.dtype.kind not in "fiu":
+        if array.ndim != 1 or array.dtype.kind not in "fiubU":
             raise ConfigurationError(
                 f"{path.name}: {name} is an array of {array.dtype} of shape {array.shape}, not a "
-                "column of numbers"
+                "column of numbers, truth values or texts"
             )
     if not arrays:
         raise ConfigurationError(f"{path.name}: is empty")
-    return {name: np.array(array, dtype=float) for name, array in arrays.items()}
+    return dict(arrays)
 
 
 # ---- Functions ----------------------------------------------------------------------------------
@@ -197,18 +225,19 @@ def _function(setting: InputSettings, system: System) -> SignalFunction:
     assert function is not None
     start = float(system.simulation.start_time)
     try:
-        value = float(function(start))
+        value = function(start)
+        is_finite = isinstance(value, str | bytes) or isfinite(float(value))
     except Exception as error:
         raise ConfigurationError(
             f"the function fails at t={start!r} s: {type(error).__name__}: {error}"
         ) from error
-    if not isfinite(value):
+    if not is_finite:
         raise ConfigurationError(f"the function is {value!r} at t={start!r} s")
     breakpoints = tuple(sorted(set(map(float, setting.breakpoints))))
     return SignalFunction(function, breakpoints, setting.order)
 
 
-def _load_function(reference: str, base: Path) -> Callable[[float], float]:
+def _load_function(reference: str, base: Path) -> Callable[[float], Any]:
     place, separator, name = reference.rpartition(":")
     if not (separator and place and name):
         raise ConfigurationError(

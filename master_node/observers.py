@@ -171,6 +171,8 @@ class Statistics:
         wall_time: seconds of the whole stepping phase.
         discontinuities: how many were found or declared.
         double_steps_at_discontinuities: attempts spent on finding and crossing them.
+        changes_at_smallest_step_size: changes of discrete outputs that are handed over late by more
+            than the tolerance, or by an unknown error, because H cannot be smaller.
         steps_above_tolerance: double steps, or single ones where no slave has rollback, that had
             ERR above 1 when it was too late to reject them.
         time: the last accepted communication point [s].
@@ -181,6 +183,7 @@ class Statistics:
     rejected_double_steps: int = 0
     discontinuities: int = 0
     double_steps_at_discontinuities: int = 0
+    changes_at_smallest_step_size: int = 0
     steps_above_tolerance: int = 0
     round_trips: int = 0
     wait_time: float = 0.0

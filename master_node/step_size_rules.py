@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from math import ulp
 
 from master_node.configuration import System
 from master_node.external_inputs import Jump
@@ -15,6 +16,10 @@ from master_node.numerics.step_size_limits import (
 )
 from protocol.errors import ConfigurationError
 from protocol.slave import SlaveDescription
+
+_RESOLUTION = 64.0
+"""H is that many times the distance of neighbouring numbers at least: T + H is a later time then,
+and H is what it is to about a percent."""
 
 
 def with_fixed_steps(system: System, descriptions: Mapping[str, SlaveDescription]) -> System:
@@ -40,6 +45,7 @@ def step_size_limits(system: System) -> StepSizeLimits:
         system, settings.smallest, settings.largest, long_step=settings.estimator == "rich"
     )
     reached = start = float(settings.start_time)
+    ways = []
     for event in sorted(settings.events):
         crossing = limits.crossing(start, float(event))
         if crossing.begin <= reached or crossing.end >= settings.end:
@@ -47,7 +53,14 @@ def step_size_limits(system: System) -> StepSizeLimits:
                 f"{system.source}: [simulation] events: {event!r} is too near to another event or "
                 "to an end of the simulated time"
             )
+        ways.append((reached, crossing.begin))
         reached = crossing.end
+    try:
+        limits.check_ways(start, [*ways, (reached, settings.end)])
+    except StepSizeLimitsError as error:
+        raise ConfigurationError(
+            f"{system.source}: no communication step size suits all: {error}"
+        ) from None
     return limits
 
 
@@ -75,7 +88,13 @@ def crossings(
         following = bisect_right(begins, crossing.begin)
         free = max([reached, *(c.end for c, _ in declared[:following][-1:])])
         ahead = min([stop, *begins[following : following + 1]])
-        if free <= crossing.begin and crossing.end <= ahead and crossing.end < stop:
+        if jump.is_held and limits.quantum is None and crossing.begin < free < jump.time:
+            # Told late by two of the smallest H at most; a later one could be of any size.
+            crossing = DoubleStepTimes.from_step_size(free, limits.smallest)
+        is_between = free <= crossing.begin and crossing.end <= ahead and crossing.end < stop
+        if is_between and all(
+            limits.leads(start, *way) for way in ((free, crossing.begin), (crossing.end, ahead))
+        ):
             found.append((crossing, f"{jump.name} jumps"))
             reached = crossing.end
     return sorted(declared + found)
@@ -118,10 +137,14 @@ def _limits(
         )
         for name, slave in system.slaves.items()
     ]
+    start, stop = float(system.simulation.start_time), system.simulation.end
+    resolution = _RESOLUTION * ulp(max(abs(start), abs(stop)))
+    if smallest < resolution:
+        smallest, given_by = resolution, f"the numbers near t={max(start, stop, key=abs)!r} s"
     try:
         limits = StepSizeLimits.of(rules, smallest, largest, long_step=long_step, given_by=given_by)
         together = 1 if system.simulation.estimator == "none" else 2
-        limits.check_span(float(system.simulation.start_time), system.simulation.end, together)
+        limits.check_span(start, stop, together)
     except StepSizeLimitsError as error:
         raise ConfigurationError(
             f"{system.source}: no communication step size suits all: {error}"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from master_node.configuration import System
 from master_node.connections import ScalarConnection, VariableFinder, resolve_connections
 from master_node.discrete_coupling import DiscreteCoupling, couple_discrete
-from master_node.external_inputs import ExternalInputs
+from master_node.external_inputs import ExternalInputs, Jump
 from master_node.external_resolution import (
     Signals,
     SlaveExternals,
@@ -44,9 +44,9 @@ class SlavePart:
         inputs: names of its continuous inputs that are driven: first the connected ones, then the
             external ones; these are the columns of what it is given.
         outputs: names of its continuous real outputs.
-        discrete_inputs, discrete_outputs: names of its other connected inputs, and of its other
-            outputs.
-        held: values of its other external inputs, by name.
+        discrete_inputs, discrete_outputs: names of its other inputs, first the connected ones, then
+            those that change from outside, and of its other outputs.
+        held: constants for its other external inputs, by name.
         input_slice, output_slice: where its connected inputs and its outputs are in u and y.
         external_slice: where its external inputs are among those of the system.
         external_rows: how many rows of derivatives these need at most.
@@ -162,6 +162,11 @@ class CoupledSystem:
     external: ExternalInputs
     held_feed_through: NDArray[np.bool_]
 
+    @property
+    def jumps(self) -> list[Jump]:
+        """Of all that drives inputs from outside, in order of time."""
+        return sorted((*self.external.jumps, *self.discrete.jumps))
+
     @cached_property
     def _transforms(self) -> bool:
         return bool((self.factor != 1.0).any() or (self.offset != 0.0).any())
@@ -230,8 +235,16 @@ def resolve(
     slave_index = {name: i for i, name in enumerate(descriptions)}
     discrete = couple_discrete(
         descriptions,
-        [[feeding[part.name][name] for name in part.discrete_inputs] for part in parts],
+        [
+            [
+                feeding[part.name][name]
+                for name in part.discrete_inputs
+                if name in feeding[part.name]
+            ]
+            for part in parts
+        ],
         output_index,
+        [external[part.name].driven for part in parts],
     )
     return CoupledSystem(
         parts=parts,
@@ -294,8 +307,9 @@ def _parts(
                     *(one.variable for one in external[name].continuous),
                 ),
                 outputs=tuple(v.name for v in outputs[name]),
-                discrete_inputs=tuple(
-                    v.name for v in connected if not feeding[name][v.name].is_continuous
+                discrete_inputs=(
+                    *(v.name for v in connected if not feeding[name][v.name].is_continuous),
+                    *(one.variable for one in external[name].driven),
                 ),
                 discrete_outputs=tuple(
                     v.name for v in description.of(Causality.OUTPUT) if v.is_discrete

@@ -52,6 +52,34 @@ def test_discrete_outputs_switch_other_slaves(capability_dir: Path, estimator: s
     assert result["clock.toggle_out"].dtype == np.bool_
 
 
+@pytest.mark.parametrize("estimator", ["mod", "rich"])
+@pytest.mark.parametrize(
+    ("rules", "smallest", "delay"),
+    [
+        ({"step_multiple": 0.01}, 0.01, 0.0),
+        ({"step_multiple": 0.004}, 0.004, 0.004),
+        ({"smallest_step_size": 0.01, "largest_step_size": 0.06}, 0.01, 0.01),
+    ],
+)
+def test_changes_are_found_where_steps_have_rules(
+    capability_dir: Path, estimator: str, rules: dict[str, float], smallest: float, delay: float
+) -> None:
+    """A change is handed over at the first point that the rules allow, on grids too.
+
+    So what it does is late by no more than the smallest H, and exact where it is on the grid. That
+    H could not be smaller is counted.
+    """
+    system = clock_and_device(capability_dir).with_slave("clock", **rules)
+    result = simulate(system, in_process=True, estimator=estimator)
+    error = np.abs(result["device.real_continuous_out"] - switched_lag(result.time))
+    assert error.max() <= 1.01 * delay + 1e-9
+    assert result.summary["discontinuities"] == 4
+    assert result.summary["changes_at_smallest_step_size"] == 4
+    steps = result.steps["step_size"]
+    assert steps.min() >= smallest - 1e-9
+    assert steps.max() >= 2.0 * smallest
+
+
 def test_values_are_held_and_handed_on(capability_dir: Path) -> None:
     """At every point each output of the device belongs to the clock's value one point before."""
     result = simulate(clock_and_device(capability_dir), in_process=True)

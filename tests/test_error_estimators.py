@@ -303,6 +303,29 @@ def test_step_sizes_stay_within_their_bounds(step_size: float, error: float, p: 
     assert 1e-4 <= bounds.after_discard(step_size, error) <= 1e-2
 
 
+any_number = st.one_of(
+    st.floats(0.0), st.sampled_from([0.0, 5e-324, 1e-310, 1.0, 1e308, math.inf, math.nan])
+)
+
+
+@given(any_number, any_number, st.integers(1, 5), st.booleans(), st.sampled_from(sorted(EXPONENTS)))
+def test_no_error_is_too_small_or_too_large_for_a_controller(
+    error: float, before: float, p: int, rejected: bool, name: str
+) -> None:
+    """Law: H changes by theta_min to theta_max whatever ERR is now and was before.
+
+    The smallest numbers, whose inverse is none, infinity and NaN are among them. A smaller error
+    never has a smaller H.
+    """
+    controller = StepSizeController(0.85, 0.3, 2.0, 1e-9, 1e3, *EXPONENTS[name])
+    memory = ControllerMemory(before if before <= 1.0 else math.nan, rejected)
+    accepted, following, _ = controller.decide(1e-3, error, p, memory)
+    assert accepted == (error <= 1.0)
+    assert 0.3e-3 <= following <= 2e-3
+    if error <= 1.0 and error > 0.0:
+        assert controller.decide(1e-3, error / 2.0, p, memory).step_size >= following
+
+
 @given(st.floats(1e-6, 1.0), st.floats(0.0, 1.0))
 def test_after_a_discard_the_step_goes_not_beyond_what_was_reached(
     step_size: float, reached: float

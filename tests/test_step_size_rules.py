@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System
@@ -17,8 +17,9 @@ from master_node.numerics.step_size_limits import (
     StepSizeLimits,
     StepSizeLimitsError,
 )
+from master_node.step_size_rules import check_step_sizes
 from protocol.calls import StepResult
-from protocol.errors import ConfigurationError
+from protocol.errors import ConfigurationError, StepSizeError
 from protocol.slave import Capabilities, Slave
 from tests.quarter_car_case import ALL, CHASSIS, DISPLACEMENT, WHEEL, LinearSlave, run_slaves
 
@@ -90,6 +91,7 @@ some_rules = rules_of(st.sampled_from([1e-4, 5e-4, 1e-3]))
 
 
 @settings(max_examples=30)
+@example({"smallest_step_size": 1.5e-3, "largest_step_size": 5e-3}, {}, "rich", "jacobi", (0.08,))
 @given(
     some_rules,
     some_rules,
@@ -152,6 +154,55 @@ def test_the_bounds_hold_to_the_last_step(
         assert times.end > time
         time, number = times.end, number + 1
     assert time == target
+
+
+@given(st.floats(-1e9, 1e9), st.floats(1e-3, 1.0), st.integers(0, 40), st.floats(1.0, 1.9))
+def test_rounding_makes_no_gap(begin: float, smallest: float, number: int, ratio: float) -> None:
+    """Law: a way of some double steps of the smallest H is one, wherever it begins.
+
+    Steps between close bounds fill few distances, and rounding must not miss these.
+    """
+    limits = StepSizeLimits(smallest, ratio * smallest)
+    target, time = begin, begin
+    for _ in range(number):
+        target += 2.0 * smallest
+    assert limits.leads(begin, begin, target)
+    slack = 1e-6 * smallest + 1e-15 * abs(begin)
+    while time < target:
+        times = limits.times(begin, time, smallest, target)
+        assert smallest - slack <= times.first <= limits.largest + slack
+        time = times.end
+    assert time == target
+
+
+def test_what_no_double_steps_fill_is_told() -> None:
+    """Of 3 to 4 ms each: 4.5 ms between an event and the stop time have none, 5.9 ms before one."""
+    limits = {"smallest_step_size": 1.5e-3, "largest_step_size": 2e-3}
+    for setting in ({"stop_time": 0.086}, {"events": (0.0074,)}):
+        with pytest.raises(ConfigurationError, match=r"there are no double steps of two times"):
+            run({}, {}, **{"events": (0.08,), **limits, **setting})
+
+
+def test_a_step_size_that_cannot_be_smaller_is_not_tried_for_ever() -> None:
+    """7.4 ms are two double steps of 1.7 ms and more, where H may be 1.5 ms elsewhere."""
+    limits = {"smallest_step_size": 1.5e-3, "largest_step_size": 2e-3, "stop_time": 7.4e-3}
+    with pytest.raises(StepSizeError, match=r"rejected at the smallest .* step size"):
+        run({}, {}, **limits, relative_tolerance=1e-9, absolute_tolerance=1e-12, order=0)
+
+
+@pytest.mark.parametrize("estimator", ["mod", "rich", "none"])
+def test_time_goes_on_where_numbers_are_far_apart(estimator: str) -> None:
+    """At 1e9 s neighbouring numbers are 0.12 µs apart, so H is not a nanosecond.
+
+    A fixed step that is no larger than that is told before anything starts.
+    """
+    span = {"start_time": 1e9, "stop_time": 1e9 + 0.5, "estimator": estimator}
+    result, _ = run({}, {}, **span)
+    assert result.time[-1] == span["stop_time"]
+    assert (np.diff(result.time) > 0.0).all()
+    limits = {"initial_step_size": 1e-7, "largest_step_size": 1e-7}
+    with pytest.raises(ConfigurationError, match=r"the numbers near t=1000000000\.5 s"):
+        check_step_sizes(System(simulation={**span, **limits}, slaves={"chassis": {}}))
 
 
 def test_a_slave_of_one_step_size_among_others() -> None:

@@ -11,6 +11,7 @@ from math import inf
 
 import numpy as np
 
+from master_node.numerics.powers import power
 from protocol.signals import FloatArray
 
 _SMALL = 1e-5
@@ -81,9 +82,9 @@ def initial_step_size(
     d1 = _norm((y_middle - y) / trial, scale)
     d2 = _norm((y_end - 2.0 * y_middle + y) / trial**2, scale)
     largest = max(d1, d2)
-    power = max(exponent, 2)  # a solution is at least once differentiable
-    by_derivatives = (0.01 / largest) ** (1.0 / power) if largest > 0.0 else inf
-    by_error = trial * error_norm ** (-1.0 / exponent) if error_norm > 0.0 else inf
+    degree = max(exponent, 2)  # a solution is at least once differentiable
+    by_derivatives = (0.01 / largest) ** (1.0 / degree) if largest > 0.0 else inf
+    by_error = trial * power(error_norm, -1.0 / exponent) if error_norm > 0.0 else inf
     return min(100.0 * trial, max(by_derivatives, trial), by_error)
 
 

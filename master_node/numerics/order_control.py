@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import inf, sqrt
-from math import pow as power
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -24,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
+from master_node.numerics.powers import power
 from protocol.signals import MAX_ORDER, FloatArray
 
 GAIN = 1.15

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil, isfinite, isnan, ulp
-from math import pow as power
 from typing import NamedTuple
+
+from master_node.numerics.powers import power
 
 
 class ControllerMemory(NamedTuple):

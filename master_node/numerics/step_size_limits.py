@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import ceil, lcm
+from math import ceil, lcm, ulp
 from typing import NamedTuple, TypeVar
 
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.step_size_controller import last_step_size
+
+_ROUNDING = 1e-10
+"""Part of the smallest H by which a step may miss its bounds, as differences of times do."""
 
 
 class SlaveLimits(NamedTuple):
@@ -105,6 +108,59 @@ class StepSizeLimits:
                 f"{float(self.quantum)!r} s"
             )
 
+    def check_ways(self, origin: float, ways: Sequence[tuple[float, float]]) -> None:
+        """Whether double steps lead from each beginning to its end [s].
+
+        Args:
+            origin: from where multiples are counted [s].
+            ways: beginnings and ends.
+
+        Raises:
+            StepSizeLimitsError: one cannot be filled with double steps between the bounds of H.
+        """
+        for begin, end in ways:
+            if not self.leads(origin, begin, end):
+                raise StepSizeLimitsError(
+                    f"from {begin!r} s to {end!r} s there are no double steps of two times "
+                    f"{self.smallest!r} s to two times {self.largest!r} s each"
+                )
+
+    @property
+    def lead_everywhere(self) -> bool:
+        """Whether double steps lead to any point that is not nearer than one of the smallest H."""
+        return self.quantum is None and self.largest >= 2.0 * self.smallest
+
+    def leads(self, origin: float, begin: float, end: float) -> bool:
+        """Whether double steps between the bounds of H lead from ``begin`` to ``end`` [s]."""
+        if self.quantum is None:
+            left = (end - begin) / 2.0
+            rounding = self._rounding(begin, end)
+            return _can_be_filled(left, self.smallest - rounding, self.largest + rounding)
+        units = self._units(origin, end) - self._units(origin, begin)
+        return units % 2 == 0 and _can_be_filled(units // 2, self._fewest, self._most)
+
+    def landing(self, origin: float, begin: float, until: float, target: float) -> float | None:
+        """The last point not behind ``until`` at which a double step from ``begin`` can end [s].
+
+        Args:
+            origin: from where multiples are counted [s].
+            begin: T_n [s].
+            until: not more than twice the largest H behind ``begin`` [s].
+            target: to which double steps must lead from that point [s].
+
+        Returns:
+            None: there is none.
+        """
+        point = until
+        if self.quantum is not None:
+            done = self._units(origin, begin)
+            units = (self._units(origin, until) - done) // 2
+            point = float(_decimal(origin) + (done + 2 * units) * self.quantum)
+        if point <= begin:
+            return None
+        leads = self.leads(origin, begin, point) and self.leads(origin, point, target)
+        return point if leads else None
+
     def times(
         self, origin: float, begin: float, step_size: float, target: float
     ) -> DoubleStepTimes:
@@ -121,19 +177,20 @@ class StepSizeLimits:
         """
         if self.quantum is None:
             size = last_step_size(begin, target, step_size)
-            size = _planned(size, (target - begin) / 2.0, self.smallest, self.largest)
-            is_last = 2.0 * size >= target - begin
+            left = (target - begin) / 2.0
+            rounding = self._rounding(begin, target)
+            size = _planned(size, left, self.smallest, self.largest, rounding)
+            is_last = size >= left
             return DoubleStepTimes.from_step_size(begin, size, target if is_last else None)
         quantum, zero = self.quantum, _decimal(origin)
-        done = round((Fraction(begin) - zero) / quantum)
-        left = (round((Fraction(target) - zero) / quantum) - done) // 2
-        fewest = max(1, ceil(_decimal(self.smallest) / quantum))
-        units = max(fewest, int(_decimal(step_size) // quantum))
-        if units >= left:
-            units = left
-        elif 2 * units > left:
-            units = (left + 1) // 2
-        units = max(1, _planned(units, left, fewest, int(_decimal(self.largest) // quantum)))
+        done = self._units(origin, begin)
+        left_units = (self._units(origin, target) - done) // 2
+        units = max(self._fewest, int(_decimal(step_size) // quantum))
+        if units >= left_units:
+            units = left_units
+        elif 2 * units > left_units:
+            units = (left_units + 1) // 2
+        units = max(1, _planned(units, left_units, self._fewest, self._most, 0))
         size = float(units * quantum)
         middle = float(zero + (done + units) * quantum)
         end = float(zero + (done + 2 * units) * quantum)
@@ -149,20 +206,40 @@ class StepSizeLimits:
         if self.quantum is None:
             left = target - begin
             size = left if step_size >= left else min(step_size, left / 2.0)
-            size = _planned(size, left, self.smallest, self.largest)
+            rounding = self._rounding(begin, target)
+            size = _planned(size, left, self.smallest, self.largest, rounding)
             return (target, left) if size >= left else (begin + size, size)
         quantum, zero = self.quantum, _decimal(origin)
-        done = round((Fraction(begin) - zero) / quantum)
-        units_left = round((Fraction(target) - zero) / quantum) - done
-        fewest = max(1, ceil(_decimal(self.smallest) / quantum))
-        units = max(fewest, int(_decimal(step_size) // quantum))
+        done = self._units(origin, begin)
+        units_left = self._units(origin, target) - done
+        units = max(self._fewest, int(_decimal(step_size) // quantum))
         if units >= units_left:
             units = units_left
         elif 2 * units > units_left:
             units = (units_left + 1) // 2
-        most = int(_decimal(self.largest) // quantum)
-        units = max(1, _planned(units, units_left, fewest, most))
+        units = max(1, _planned(units, units_left, self._fewest, self._most, 0))
         return float(zero + (done + units) * quantum), float(units * quantum)
+
+    def _rounding(self, begin: float, end: float) -> float:
+        """By what H of a double step between these times may miss its bounds [s]."""
+        return 4.0 * ulp(max(abs(begin), abs(end))) + _ROUNDING * self.smallest
+
+    def _units(self, origin: float, time: float) -> int:
+        """Of how many quanta ``time`` [s] is from ``origin`` [s]."""
+        assert self.quantum is not None
+        return round((Fraction(time) - _decimal(origin)) / self.quantum)
+
+    @property
+    def _fewest(self) -> int:
+        """Of how many quanta H is at least."""
+        assert self.quantum is not None
+        return max(1, ceil(_decimal(self.smallest) / self.quantum))
+
+    @property
+    def _most(self) -> int:
+        """Of how many quanta H is at most."""
+        assert self.quantum is not None
+        return int(_decimal(self.largest) // self.quantum)
 
     def crossing(self, origin: float, event: float) -> DoubleStepTimes:
         """The double step of the smallest size that leads over an event at ``event`` [s].
@@ -183,7 +260,7 @@ class StepSizeLimits:
 _Size = TypeVar("_Size", int, float)
 
 
-def _planned(size: _Size, left: _Size, smallest: _Size, largest: _Size) -> _Size:
+def _planned(size: _Size, left: _Size, smallest: _Size, largest: _Size, rounding: _Size) -> _Size:
     """A size near ``size`` that leaves a rest which sizes between the bounds can fill.
 
     n sizes fill what is between n times the smallest and n times the largest. A rest in a gap
@@ -194,14 +271,22 @@ def _planned(size: _Size, left: _Size, smallest: _Size, largest: _Size) -> _Size
         left: to fill with this size and those that follow.
         smallest: bound of all of them.
         largest: bound of all of them.
+        rounding: by which each size may miss the bounds.
     """
+    low, high = smallest - rounding, largest + rounding
     rest = left - size
-    number = ceil(rest / largest)
-    if number * smallest <= rest:
+    number = ceil(rest / high)
+    if number * low <= rest:
         return size
-    if left - number * smallest >= smallest:
-        return left - number * smallest
-    return min(left, left - (number - 1) * largest)
+    smaller = left - number * low
+    if smaller >= low - rounding:  # the last step was rounded too
+        return smaller
+    return min(left, left - (number - 1) * high)
+
+
+def _can_be_filled(left: _Size, smallest: _Size, largest: _Size) -> bool:
+    """Whether sizes between the bounds fill what is left; see `_planned`."""
+    return ceil(left / largest) * smallest <= left
 
 
 def _fixed(

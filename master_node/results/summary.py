@@ -39,6 +39,7 @@ def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> d
             "rejected_double_steps": statistics.rejected_double_steps,
             "discontinuities": statistics.discontinuities,
             "double_steps_at_discontinuities": statistics.double_steps_at_discontinuities,
+            "changes_at_smallest_step_size": statistics.changes_at_smallest_step_size,
             "steps_above_tolerance": statistics.steps_above_tolerance,
             "controlled_by": start.control._asdict(),
             "state_kind": start.state_kinds,
