@@ -39,7 +39,7 @@ from protocol.slave import (
     StateVerdict,
     StepStatus,
 )
-from slave_node.worker import ModelReference, WorkerProcess
+from slave_node.worker import ModelReference, Worker, WorkerProcess
 
 DEFAULT_STEP_SIZE = 1e-2
 _STEPS = 10
@@ -71,13 +71,19 @@ class Finding:
     consequence: str = ""
 
 
-def validate(model: str, base: Path, step_size: float | None = None) -> Iterator[Finding]:
+def validate(
+    model: str,
+    base: Path,
+    step_size: float | None = None,
+    worker: Callable[[ModelReference], Worker] = WorkerProcess,
+) -> Iterator[Finding]:
     """Try a model and report, finding by finding.
 
     Args:
         model: see `slave_node.loading.load_slave`.
         base: directory to which its path is relative.
         step_size: of the trial steps [s]; None: what the model recommends, or 10 ms.
+        worker: makes the one that runs it.
 
     Raises:
         ModelError: the model is missing or cannot be read.
@@ -86,7 +92,7 @@ def validate(model: str, base: Path, step_size: float | None = None) -> Iterator
         from slave_node.fmu.validation import description_problems  # noqa: PLC0415  only for FMUs
 
         yield _description((base / model).resolve(), description_problems)
-    trial = _Trial(ModelReference(model, base, "validated"))
+    trial = _Trial(worker(ModelReference(model, base, "validated")))
     try:
         description = trial.start()
         size = step_size or description.fixed_step_size or description.default_step_size
@@ -107,10 +113,10 @@ def _description(fmu: Path, problems_of: Callable[[Path], list[str]]) -> Finding
 
 
 class _Trial:
-    """A model in a process of its own, brought to its first communication point again and again."""
+    """A model that is brought to its first communication point again and again."""
 
-    def __init__(self, reference: ModelReference) -> None:
-        self._worker = WorkerProcess(reference)
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
         self._is_fresh = True
 
     def start(self) -> SlaveDescription:

@@ -8,6 +8,7 @@ import os
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import importlib.util
+import shutil
 import socket
 import sys
 from collections.abc import Callable, Iterator
@@ -80,6 +81,32 @@ def capability_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with the FMUs of all capabilities."""
     folder = tmp_path_factory.mktemp("capabilities")
     _example("capabilities", "build").build(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def no_rollback_dir(fmu_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the example of FMUs whose state cannot be saved."""
+    folder = tmp_path_factory.mktemp("examples") / "no_rollback"
+    (folder.parent / "quarter_car").symlink_to(fmu_dir)
+    _example("no_rollback", "build").build(folder, whole_car=fmu_dir)
+    for file in (EXAMPLES / "no_rollback").glob("*.toml"):
+        shutil.copy(file, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def python_fmu_build() -> ModuleType:
+    """The script that builds the FMUs in Python."""
+    return _example("python_fmu", "build")
+
+
+@pytest.fixture(scope="session")
+def python_fmu_dir(python_fmu_build: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the example of FMUs in Python."""
+    folder = tmp_path_factory.mktemp("python_fmu")
+    python_fmu_build.build(folder)
+    shutil.copy(EXAMPLES / "python_fmu" / "quarter_car.toml", folder)
     return folder
 
 

@@ -142,7 +142,11 @@ def test_a_command_line_in_a_document_can_be_given(document: str, words: list[st
     elif program.endswith("python"):
         files = check_python(arguments)
     else:
-        assert words in (["pip", "install", "."], ["cd", "examples/quarter_car"])
+        assert words in (
+            ["pip", "install", "."],
+            ["pip", "install", "pythonfmu", "pythonfmu3"],
+            ["cd", "examples/quarter_car"],
+        )
         files = []
     for file in files:
         assert (ROOT / file).is_file(), f"{document} names {file}"
@@ -574,13 +578,33 @@ def test_every_row_of_the_fault_matrix_names_tests_that_exist() -> None:
     (table,) = tables(section(read("docs/reliability.md"), "## The fault matrix"))
     assert len(table) > 25
     for fault, _, proofs in table[1:]:
-        named = re.findall(r"`(tests/test_\w+\.py)::(\w+)`", proofs)
-        assert named, f"no test for: {fault}"
-        assert proofs.count("`") == 2 * len(named), f"not a test: {proofs}"
-        for file, test in named:
-            tree = ast.parse(read(file))
-            tests = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
-            assert test in tests, f"{file} has no {test}"
+        check_tests(fault, proofs)
+
+
+def check_tests(what: str, proofs: str) -> None:
+    """That a cell names tests, all of which exist."""
+    named = re.findall(r"`(tests/test_\w+\.py)::(\w+)`", proofs)
+    assert named, f"no test for: {what}"
+    assert proofs.count("`") == 2 * len(named), f"not a test: {proofs}"
+    for file, test in named:
+        tree = ast.parse(read(file))
+        tests = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+        assert test in tests, f"{file} has no {test}"
+
+
+# --- examples -----------------------------------------------------------------------------------
+
+
+def test_every_part_of_what_fmus_can_do_has_a_command_and_a_test() -> None:
+    """The twelve rows of the table of examples: systems that are there, tests that exist."""
+    part_table, _ = tables(read("examples/README.md"))
+    assert len(part_table) == 1 + 12
+    for part, _, command, proofs in part_table[1:]:
+        program, name, file = command.strip("`").split()
+        assert name in get_command(APPS[program]).commands
+        if file.endswith(".toml"):  # FMUs and packages are built
+            assert (ROOT / file).is_file(), f"{part}: {file}"
+        check_tests(part, proofs)
 
 
 def test_the_bounds_of_waits_are_those_of_the_program() -> None:

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from master_node import Result, System, simulate
+from master_node import Result, System, load_system, simulate
 from master_node.numerics.defect_control import TARGET, foreseen_step_size, largest_between
 from master_node.numerics.error_estimators import node_polynomial
 from master_node.numerics.initial_step_size import untried_step_size
@@ -615,18 +615,17 @@ def test_the_summary_says_which_outputs_are_controlled_how(
 
 
 @pytest.mark.usefixtures("no_process_left")
-@pytest.mark.parametrize("without", [("wheel",), ("chassis", "wheel")])
+@pytest.mark.parametrize(
+    ("file", "without"),
+    [("wheel_without_state.toml", ("wheel",)), ("nothing_saved.toml", ("chassis", "wheel"))],
+)
 def test_fmus_without_saved_states_run_under_error_control(
-    without: Collection[str], fmu_dir: Path, tmp_path: Path
+    file: str, without: Collection[str], no_rollback_dir: Path, tmp_path: Path
 ) -> None:
-    """Real FMUs in processes of their own, over Zenoh, and the same bits in this process."""
-    options = {"order": "auto", "initial_step_size": None}
-    system = car("chassis.fmu", "wheel.fmu", base=fmu_dir, **options)
-    slaves = {
-        name: settings.model_copy(update={"state": "none"}) if name in without else settings
-        for name, settings in system.slaves.items()
-    }
-    system = system.model_copy(update={"slaves": slaves})
+    """The examples, with real FMUs in processes of their own, over Zenoh, and the same bits in this
+    process.
+    """
+    system = load_system(no_rollback_dir / file)
     result = simulate(system, output=tmp_path / "results")
     assert global_errors(result).max() < 3e-4
     summary = json.loads((tmp_path / "results" / "summary.json").read_text())

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -946,11 +947,14 @@ def test_formats_are_imported_when_they_are_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the results of the example."""
+def example(fmu_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the results of the example, whose FMUs run in processes of their own."""
     folder = tmp_path_factory.mktemp("example")
-    system = load_system(ROOT / "examples" / "results" / "all_formats.toml")
-    simulate(system, in_process=True, output=folder / "results")
+    (folder / "quarter_car").symlink_to(fmu_dir)
+    (folder / "example").mkdir()
+    shutil.copy(ROOT / "examples" / "results" / "all_formats.toml", folder / "example")
+    system = load_system(folder / "example" / "all_formats.toml")
+    simulate(system, output=folder / "results")
     return folder
 
 

@@ -27,14 +27,17 @@ MODELS = ("chassis", "wheel")
 _DENIED = ("canGetAndSetFMUstate", "canSerializeFMUstate")
 
 
-def build(output: Path, *, force: bool = False) -> list[Path]:
+def build(
+    output: Path, *, force: bool = False, whole_car: Path = FOLDER.parent / "quarter_car"
+) -> list[Path]:
     """Build into the folder ``output`` what is missing or older than the FMUs that it is made of.
 
-    Returns the paths of the FMUs, in the order of ``MODELS``. See `build_fmus` for what is raised.
+    Those are built into the folder ``whole_car`` if they are missing there. Returns the paths of
+    the FMUs, in the order of ``MODELS``. See `build_fmus` for what is raised.
     """
     output.mkdir(parents=True, exist_ok=True)
     made = []
-    for whole in _quarter_car().build(FOLDER.parent / "quarter_car", force=force):
+    for whole in _quarter_car().build(whole_car, force=force):
         if whole.stem not in MODELS:
             continue
         fmu = output / f"{whole.stem}_without_state.fmu"

@@ -16,6 +16,7 @@ from fmpy import read_model_description
 from protocol.errors import ModelError
 from protocol.slave import Causality, SlaveDescription, StartValue, StateKind, VariableType
 from slave_node.fmu.archive import extract
+from slave_node.fmu.embedded_python import log_categories, slave_module
 from slave_node.fmu.interfaces import (
     Interface,
     default_step_size,
@@ -88,12 +89,19 @@ def read_fmu(
         return FmuModel(
             fmu,
             directory,
-            _description(fmu, model_description, root, interface, variables),
+            _description(
+                fmu,
+                model_description,
+                root,
+                interface,
+                variables,
+                remarks=_remarks(directory, model_description, interface),
+            ),
             interface,
             variables.places,
             structural_parameters or {},
             model_description.guid or "",
-            tuple(category.name for category in model_description.logCategories),
+            log_categories(directory, [c.name for c in model_description.logCategories]),
         )
     except ModelError as error:
         raise ModelError(f"{fmu}: {error.cause}", remedy=error.remedy) from error
@@ -119,7 +127,13 @@ def _version(root: Element) -> Callable[[Any, Element], Interface]:
 
 
 def _description(
-    fmu: Path, model_description: Any, root: Element, interface: Interface, variables: Variables
+    fmu: Path,
+    model_description: Any,
+    root: Element,
+    interface: Interface,
+    variables: Variables,
+    *,
+    remarks: tuple[str, ...],
 ) -> SlaveDescription:
     saves_state = interface.capabilities.can_get_and_set_state
     feed_through = _feed_through(model_description, root, variables, interface.version)
@@ -137,7 +151,7 @@ def _description(
         fixed_step_size=interface.fixed_step_size,
         default_step_size=default_step_size(model_description),
         units=units(model_description),
-        remarks=tuple(_remarks(model_description, interface)),
+        remarks=remarks,
         sha256=hashlib.sha256(fmu.read_bytes()).hexdigest(),
         guid=model_description.guid or "",
         generation_tool=model_description.generationTool or "",
@@ -197,7 +211,7 @@ def _direct_dependencies(root: Element) -> dict[str, tuple[str, ...]]:
     }
 
 
-def _remarks(model_description: Any, interface: Interface) -> list[str]:
+def _remarks(directory: Path, model_description: Any, interface: Interface) -> tuple[str, ...]:
     """What of the FMU is not carried, and what it needs."""
     remarks = [
         f"clock {v.name} ({v.intervalVariability or 'without interval'}) is ignored"
@@ -209,10 +223,12 @@ def _remarks(model_description: Any, interface: Interface) -> list[str]:
         for v in model_description.modelVariables
         if v.clocks and v.causality in (Causality.INPUT, Causality.OUTPUT)
     ]
-    if interface.needs_execution_tool:
+    if slave_module(directory) is not None:
+        remarks.append("its Python code runs in the Python of this slave-node")
+    elif interface.needs_execution_tool:
         tool = model_description.generationTool or "the tool that exported it"
         remarks.append(f"it needs {tool} on the host that runs it")
     can_vary = interface.capabilities.can_handle_variable_step_size
     if not can_vary and interface.fixed_step_size is None:
         remarks.append("it takes one communication step size only, and does not say which")
-    return remarks
+    return tuple(remarks)

@@ -22,6 +22,7 @@ from protocol.names import nearest
 from protocol.slave import StartValue, VariableType
 from slave_node.fmu.archive import PLATFORM_FOLDERS, check_binary
 from slave_node.fmu.description import FmuModel
+from slave_node.fmu.embedded_python import forget_modules, own_modules
 from slave_node.fmu.log import FmuLog
 from slave_node.fmu.values import DiscreteExchange, ValueType, check_start_value
 from slave_node.fmu.variables import Place, settable_variable
@@ -66,12 +67,16 @@ class FmuInstance(ABC):
         self.model = model
         self.log = FmuLog()
         self.fmu: Any = None
+        self._is_fatal = False
         check_binary(
             model.fmu, model.directory, model.interface.model_identifier, self.platform_folder
         )
         self.fmu = self._load(name)
         try:
-            self._instantiate(log_all=log_all)
+            with own_modules(model.fmu, model.directory):
+                self._instantiate(log_all=log_all)
+        except ModelError:
+            raise
         except Exception as error:  # fmpy raises plain exceptions for all that can go wrong
             raise ModelError(
                 self.log.explain(f"{model.fmu}: {self.prefix}Instantiate: {error}"),
@@ -171,6 +176,7 @@ class FmuInstance(ABC):
         known = 0 <= status < len(_STATUS)
         name = f"{self.prefix}{_STATUS[status]}" if known else f"status {status}"
         text = self.log.explain(f"{function} returned {name}")
+        self._is_fatal = self._is_fatal or status == FATAL
         raise FatalSlaveError(text) if status == FATAL else SlaveError(text)
 
     def call(self, method: Callable[..., T], *arguments: Any, **named: Any) -> T:
@@ -287,11 +293,13 @@ class FmuInstance(ABC):
     # ---- End ----------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Free the instance and unload the binary. Idempotent."""
+        """Free the instance and unload the binary; leave both after a fatal error. Idempotent."""
         if self.fmu is not None:
             fmu, self.fmu = self.fmu, None
-            with suppress(FMICallException):
-                fmu.freeInstance()
+            if not self._is_fatal:
+                with suppress(FMICallException):
+                    fmu.freeInstance()
+            forget_modules(self.model.directory)
 
 
 def reference_array(places: Sequence[Place]) -> np.ndarray[Any, np.dtype[np.uint32]]:

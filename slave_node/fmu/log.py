@@ -14,7 +14,11 @@ from fmpy.logging import addLoggerProxy
 
 _LINES = 20
 _SHOWN = 5
-_ERROR_CATEGORIES = {"logStatusWarning", "logStatusDiscard", "logStatusError", "logStatusFatal"}
+UNNAMED = ""
+_ERROR_CATEGORIES = {
+    *("logStatusWarning", "logStatusDiscard", "logStatusError", "logStatusFatal"),
+    UNNAMED,
+}
 
 
 class FmuLog:
