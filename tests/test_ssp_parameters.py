@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,32 @@ def test_parameters_by_name_prefix_and_level(packages: Packages) -> None:
         "v": 4.0,
         "z": 0.25,
     }
+    assert read.notes == ()
+
+
+def test_parameters_inside_an_fmu(packages: Packages, fmu_dir: Path) -> None:
+    """A set and a mapping that the component brings with it."""
+    values = parameter_set(real("mass", 7)).replace(
+        "<ssv:ParameterSet", f"<ssv:ParameterSet{NAMESPACES}"
+    )
+    mapping = (
+        f'<ssm:ParameterMapping{NAMESPACES} version="1.0">{entry("mass", "m")}'
+        "</ssm:ParameterMapping>"
+    )
+    model = packages.folder / "with_parameters.fmu"
+    model.write_bytes((fmu_dir / "wheel.fmu").read_bytes())
+    with zipfile.ZipFile(model, "a") as archive:
+        archive.writestr("resources/a.ssv", values)
+        archive.writestr("extra/a.ssm", mapping)
+    inside = (
+        '<ssd:ParameterBinding source="resources/a.ssv" sourceBase="component">'
+        '<ssd:ParameterMapping source="extra/a.ssm" sourceBase="component"/>'
+        "</ssd:ParameterBinding>"
+    )
+    source = 'source="resources/with_parameters.fmu"'
+    text = ssd(system(component("wheel", INPUTS, bindings(inside), source)))
+    read = packages.read(text, with_parameters__fmu=model)
+    assert read.system.slaves["wheel"].parameters == {"m": 7.0}
     assert read.notes == ()
 
 

@@ -229,7 +229,12 @@ def test_connections_that_are_not_supported_are_refused_by_name(
     ("inner", "told"),
     [
         ('<ssd:ParameterBinding type="text/csv" source="a.csv"/>', "type 'text/csv'"),
-        ('<ssd:ParameterBinding source="a.ssv" sourceBase="component"/>', "sourceBase"),
+        (
+            '<ssd:ParameterBinding source="a.ssv" sourceBase="component"/>',
+            "resources/wheel.fmu holds no 'a.ssv'",
+        ),
+        ('<ssd:ParameterBinding source="../a" sourceBase="component"/>', "leads outside"),
+        ('<ssd:ParameterBinding source="a.ssv" sourceBase="metaData"/>', "'metaData' is not supp"),
         ('<ssd:ParameterBinding source="../a.ssv"/>', "leads outside"),
         ('<ssd:ParameterBinding source="a.ssv"/>', "a.ssv: cannot be read"),
         ("<ssd:ParameterBinding/>", "has neither a source nor an ssv:ParameterSet"),
