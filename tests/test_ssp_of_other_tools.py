@@ -6,11 +6,10 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from master_node import load_system
-from master_node.cli import app
 from tests.quarter_car_case import EXAMPLES
+from tests.ssp_documents import invoke
 
 OMSIMULATOR = """<?xml version="1.0" encoding="UTF-8"?>
 <ssd:SystemStructureDescription
@@ -216,13 +215,6 @@ def package(tmp_path: Path, fmu_dir: Path) -> Path:
         archive.writestr("resources/wheel.ssv", mass)
         archive.writestr("resources/signalFilter.xml", '<?xml version="1.0"?><oms/>')
     return path
-
-
-def invoke(*arguments: object) -> str:
-    """Run the command line; what it printed and logged."""
-    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def test_a_package_of_omsimulator_runs(package: Path, fmu_dir: Path, tmp_path: Path) -> None:

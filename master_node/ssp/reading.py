@@ -177,13 +177,28 @@ class _Reader:
         """A nested package, extracted; gives the description in it."""
         if fragment and ("/" in fragment or not fragment.lower().endswith(".ssd")):
             raise node.error(f"{fragment!r:.200} does not name an SSD of the package")
-        self._packages += 1
-        if self._packages > MAX_PACKAGES:
-            raise node.error(f"more than {MAX_PACKAGES} packages in one another")
-        directory = self._scratch / "packages" / str(self._packages)
-        directory.mkdir(parents=True)
+        directory = self._directory(node)
         self.extract(place.path, directory)
         return _Place(directory, fragment or DEFAULT_SSD, str(place))
+
+    def inside(self, node: Node, fmu: _Place, uri: str) -> _Place:
+        """A file in an FMU, extracted; the URI is relative to the root of the FMU."""
+        directory = self._directory(node)
+        place, _ = _Place(directory, "", str(fmu)).refer(node, uri)
+        with checked_archive(fmu.path, "FMU") as archive:
+            if place.file not in archive.namelist():
+                raise node.error(f"{fmu} holds no {place.file!r:.200}")
+            archive.extract(place.file, directory)
+        return place
+
+    def _directory(self, node: Node) -> Path:
+        """A new one for what is extracted."""
+        self._packages += 1
+        if self._packages > MAX_PACKAGES:
+            raise node.error(f"more than {MAX_PACKAGES} packages, or files in FMUs, are needed")
+        directory = self._scratch / "packages" / str(self._packages)
+        directory.mkdir(parents=True)
+        return directory
 
     def count(self, node: Node, depth: int) -> None:
         """Bound what references to systems can grow to."""
@@ -314,8 +329,8 @@ class _Document:
         elif implementation not in ("any", "CoSimulation"):
             raise node.error(f"implementation {implementation!r:.60} is not supported")
         connectors = self._connectors(node)
-        bindings = self._bindings(node)
         target, fragment = self.place.refer(node, source)
+        bindings = self._bindings(node, target if kind == FMU_TYPE else None)
         if kind == FMU_TYPE:
             self.reader.count(node, depth)
             component = Component(
@@ -387,17 +402,17 @@ class _Document:
         node.done()
         return connection
 
-    def _bindings(self, node: Node) -> tuple[Binding, ...]:
+    def _bindings(self, node: Node, fmu: _Place | None = None) -> tuple[Binding, ...]:
         container = node.child("ssd:ParameterBindings")
         bindings = tuple(
-            self._binding(child) for child in _children(container, "ssd:ParameterBinding")
+            self._binding(child, fmu) for child in _children(container, "ssd:ParameterBinding")
         )
         if container is not None:
             container.done()
         return bindings
 
-    def _binding(self, node: Node) -> Binding:
-        place = self._source(node, SSV_TYPE)
+    def _binding(self, node: Node, fmu: _Place | None) -> Binding:
+        place = self._source(node, SSV_TYPE, fmu)
         if place is not None:
             parameters = self.reader.parameter_set(place)
         else:
@@ -407,7 +422,7 @@ class _Document:
         mapping = None
         element = node.child("ssd:ParameterMapping")
         if element is not None:
-            place = self._source(element, SSM_TYPE)
+            place = self._source(element, SSM_TYPE, fmu)
             mapping = (
                 self.reader.mapping(place)
                 if place is not None
@@ -418,19 +433,28 @@ class _Document:
         node.done()
         return binding
 
-    def _source(self, node: Node, type_: str) -> _Place | None:
-        """The file that a binding or a mapping refers to, None if it stands inline."""
+    def _source(self, node: Node, type_: str, fmu: _Place | None = None) -> _Place | None:
+        """The file that an element refers to, None if its content stands inline.
+
+        Args:
+            node: the element.
+            type_: the only one that can be read.
+            fmu: of the component that the element belongs to.
+        """
         given = node.attribute("type", type_)
         if given != type_:
             raise node.error(f"type {given!r:.100} is not supported", f"give it as {type_}")
         if not node.has("source"):
             return None
-        if node.attribute("sourceBase", "SSD") != "SSD":
-            raise node.error(
-                "sourceBase = 'component' is not supported", "put the file beside the SSD"
-            )
-        place, _ = self.place.refer(node, node.required("source"))
-        return place
+        source, base = node.required("source"), node.attribute("sourceBase", "SSD")
+        if base == "SSD":
+            place, _ = self.place.refer(node, source)
+            return place
+        if base == "component" and fmu is not None:
+            return self.reader.inside(node, fmu, source)
+        raise node.error(
+            f"sourceBase = {base!r:.60} is not supported here", "put the file beside the SSD"
+        )
 
 
 def _children(node: Node | None, *names: str) -> list[Node]:
