@@ -3,6 +3,7 @@
 import sys
 
 from benchmarks import (
+    coverage_guided,
     emulated_inputs,
     fault_points,
     fault_schedules,
@@ -60,6 +61,7 @@ TABLES = {
 }
 
 CHECKS = {
+    "coverage_guided": coverage_guided.main,
     "fault_points": fault_points.main,
     "fault_schedules": fault_schedules.main,
     "fuzz": fuzz.main,

@@ -59,6 +59,7 @@ from protocol.keys import (
 )
 from protocol.processes import has_ended
 from protocol.slave_processes import SlaveProcess, end_all
+from slave_node.ending import wait_for_end
 from slave_node.model_store import ModelStore
 from slave_node.upload_cache import UploadCache
 
@@ -162,7 +163,7 @@ class Agent:
         self._bus.announce(self._key.alive)
         log.info("ready: agent with %d models, instance %s", len(models), self._key.instance)
         try:
-            ending.wait()
+            wait_for_end(ending)
         finally:
             self.close()
 

@@ -12,6 +12,7 @@ from protocol.administration import RouterStatus
 from protocol.bus import Bus
 from protocol.codec import encode_map
 from protocol.keys import RouterKey
+from slave_node.ending import wait_for_end
 
 log = logging.getLogger("slave_node")
 
@@ -36,4 +37,4 @@ def serve_router(bus: Bus, key: RouterKey, endpoints: str, ending: threading.Eve
     bus.serve(key.status, status)
     bus.announce(key.alive)
     log.info("ready: router, instance %s", key.instance)
-    ending.wait()
+    wait_for_end(ending)
