@@ -32,6 +32,7 @@ from protocol.codec import decode_reply, encode_program
 from protocol.errors import (
     DeadlineError,
     DoublestepError,
+    FatalSlaveError,
     SlaveCrashedError,
     SlaveError,
     StepRejectedError,
@@ -130,7 +131,7 @@ def _description(fmu: Path) -> Finding:
         result = "valid" if has_parsed_names else "valid; too many names to parse all of them"
         return Finding("model description", Grade.OK, result)
     more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
-    text = "; ".join(problem[:160] for problem in problems[:3])
+    text = "; ".join(problem[:160].rstrip(".") for problem in problems[:3])
     return Finding("model description", Grade.NOTE, text + more, "it is read as far as it goes")
 
 
@@ -231,12 +232,11 @@ class _Validation:
     def _initialization(self) -> Finding:
         reply = self._trial.again(*self._begin, GetOutputs(), GetDiscreteOutputs())
         if reply.error is not None:
-            return Finding(
-                "initialize",
-                Grade.PROBLEM,
-                f"{reply.error.phase}: {reply.error.cause}",
-                "it cannot be run with its start values; give others in parameters",
-            )
+            consequence = "it cannot be run with its start values; give others in parameters"
+            if isinstance(reply.error, FatalSlaveError):
+                consequence = "it cannot be run here: the FMU gave up"
+            result = f"{reply.error.phase}: {reply.error.cause}"
+            return Finding("initialize", Grade.PROBLEM, result, consequence)
         y: FloatArray = reply.results[-2]  # type: ignore[assignment]
         bad = [name for name, value in zip(self._outputs, y[0], strict=True) if value - value != 0]
         if bad:
