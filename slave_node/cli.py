@@ -401,6 +401,7 @@ def validate(
     step_size: Annotated[
         float | None, typer.Option(help="Of the trial steps [s] [default: the model's, or 0.01].")
     ] = None,
+    timeout: Annotated[float, typer.Option(help="Bound on each trial [s].", min=0.1)] = 60.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Try what MODEL can do, and say what Doublestep does about the rest."""
@@ -409,7 +410,7 @@ def validate(
 
     findings = []
     if as_json:
-        findings = list(trials(model, Path.cwd(), step_size))
+        findings = list(trials(model, Path.cwd(), step_size, timeout=timeout))
         typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
     else:
         from rich.console import Console  # noqa: PLC0415
@@ -418,7 +419,7 @@ def validate(
 
         console = Console()
         with console.status("trying"):
-            findings = list(trials(model, Path.cwd(), step_size))
+            findings = list(trials(model, Path.cwd(), step_size, timeout=timeout))
         console.print(report_table(model, findings))
     if not is_usable(findings):
         raise unusable(model)

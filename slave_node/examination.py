@@ -367,6 +367,9 @@ def _plain(value: float, accuracy: float) -> float:
 # ---- Step dependence ----------------------------------------------------------------------------
 
 _LARGER = (1.0, 4.0, 16.0)
+LARGEST_STEP = 2.0 * _LARGER[-1]
+"""Of all trial steps, in terms of the step size that is asked for."""
+
 _NOTICED = 1.0
 _ALLOWED = 0.1
 """Of the tolerance: the errors of the substeps of a communication step add up."""

@@ -32,12 +32,12 @@ def description_tables(description: SlaveDescription) -> list[Table]:
 
 def report_table(model: str, findings: Sequence[Finding]) -> Table:
     """The report of ``slave-node validate``."""
-    table = Table(title=model, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(title=Text(model), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("tried", "", "result", "so"):
         table.add_column(column, overflow="fold")
     for finding in findings:
-        style = _STYLES[finding.grade]
-        table.add_row(finding.what, Text(finding.grade, style), finding.result, finding.consequence)
+        grade = Text(finding.grade, _STYLES[finding.grade])
+        table.add_row(finding.what, grade, Text(finding.result), Text(finding.consequence))
     return table
 
 
@@ -45,7 +45,7 @@ _STYLES = {Grade.OK: "green", Grade.NOTE: "yellow", Grade.PROBLEM: "bold red"}
 
 
 def _model(description: SlaveDescription) -> Table:
-    table = Table(title=description.model, show_header=False, title_justify="left")
+    table = Table(title=Text(description.model), show_header=False, title_justify="left")
     can = description.capabilities
     rows = {
         "kind": description.kind,
@@ -70,7 +70,7 @@ def _model(description: SlaveDescription) -> Table:
     if description.remarks:
         rows["remarks"] = "; ".join(description.remarks)
     for name, value in rows.items():
-        table.add_row(name, value or "-")
+        table.add_row(name, Text(value or "-"))
     return table
 
 
@@ -87,7 +87,7 @@ def _variables(description: SlaveDescription) -> Table:
     table.add_column("nominal", no_wrap=True, justify="right")
     table.add_column("description", min_width=12)
     for v in description.variables:
-        table.add_row(
+        cells = (
             v.name,
             v.causality.value,
             v.variability,
@@ -97,6 +97,7 @@ def _variables(description: SlaveDescription) -> Table:
             "" if v.nominal == 1.0 else str(v.nominal),
             v.description,
         )
+        table.add_row(*map(Text, cells))  # brackets of a model are no markup
     return table
 
 

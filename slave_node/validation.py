@@ -5,6 +5,7 @@ The model runs in a process of its own, which is started anew after whatever end
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
@@ -28,7 +29,14 @@ from protocol.calls import (
     Terminate,
 )
 from protocol.codec import decode_reply, encode_program
-from protocol.errors import DoublestepError, SlaveError
+from protocol.errors import (
+    DeadlineError,
+    DoublestepError,
+    FatalSlaveError,
+    SlaveCrashedError,
+    SlaveError,
+    StepRejectedError,
+)
 from protocol.signals import MAX_ORDER, FloatArray
 from protocol.slave import (
     Causality,
@@ -39,10 +47,21 @@ from protocol.slave import (
     StateVerdict,
     StepStatus,
 )
+from slave_node.examination import LARGEST_STEP
 from slave_node.worker import ModelReference, Worker, WorkerProcess
 
 DEFAULT_STEP_SIZE = 1e-2
+DEFAULT_TIMEOUT = 60.0
+"""For each trial [s]; where nothing hangs none takes a fraction of that."""
+
 _STEPS = 10
+_SHRINKS = 4
+_SHRINK = 0.1
+"""So often, and by so much, steps are made smaller that the model does not take."""
+
+_KEEPS_ZERO_STEPS = "FMI 3.0 co-simulation"
+"""Whose adapter has nothing to ask the FMU for in a step of size zero."""
+
 _LADDER = (StateKind.NATIVE, StateKind.FORK, StateKind.REPLAY, StateKind.NONE)
 
 
@@ -75,6 +94,8 @@ def validate(
     model: str,
     base: Path,
     step_size: float | None = None,
+    *,
+    timeout: float = DEFAULT_TIMEOUT,
     worker: Callable[[ModelReference], Worker] = WorkerProcess,
 ) -> Iterator[Finding]:
     """Try a model and report, finding by finding.
@@ -83,16 +104,15 @@ def validate(
         model: see `slave_node.loading.load_slave`.
         base: directory to which its path is relative.
         step_size: of the trial steps [s]; None: what the model recommends, or 10 ms.
+        timeout: bound on each trial [s], after which the worker is killed.
         worker: makes the one that runs it.
 
     Raises:
         ModelError: the model is missing or cannot be read.
     """
     if model.lower().endswith(".fmu"):
-        from slave_node.fmu.validation import description_problems  # noqa: PLC0415  only for FMUs
-
-        yield _description((base / model).resolve(), description_problems)
-    trial = _Trial(worker(ModelReference(model, base, "validated")))
+        yield _description((base / model).resolve())
+    trial = _Trial(worker(ModelReference(model, base, "validated")), timeout)
     try:
         description = trial.start()
         size = step_size or description.fixed_step_size or description.default_step_size
@@ -103,20 +123,24 @@ def validate(
         trial.stop()
 
 
-def _description(fmu: Path, problems_of: Callable[[Path], list[str]]) -> Finding:
-    problems = problems_of(fmu)
+def _description(fmu: Path) -> Finding:
+    from slave_node.fmu.validation import check_description  # noqa: PLC0415  only for FMUs
+
+    problems, has_parsed_names = check_description(fmu)
     if not problems:
-        return Finding("model description", Grade.OK, "valid")
+        result = "valid" if has_parsed_names else "valid; too many names to parse all of them"
+        return Finding("model description", Grade.OK, result)
     more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
-    text = "; ".join(problem[:160] for problem in problems[:3])
+    text = "; ".join(problem[:160].rstrip(".") for problem in problems[:3])
     return Finding("model description", Grade.NOTE, text + more, "it is read as far as it goes")
 
 
 class _Trial:
     """A model that is brought to its first communication point again and again."""
 
-    def __init__(self, worker: Worker) -> None:
+    def __init__(self, worker: Worker, timeout: float) -> None:
         self._worker = worker
+        self._timeout = timeout
         self._is_fresh = True
 
     def start(self) -> SlaveDescription:
@@ -126,11 +150,24 @@ class _Trial:
         self._worker.stop()
 
     def run(self, *calls: Call) -> Reply:
-        """Execute calls; the death of the process is the reply's error."""
+        """Execute calls; the death of the process is the reply's error, and so is no answer."""
+        is_late = threading.Event()
+
+        def end() -> None:
+            is_late.set()
+            self._worker.kill()
+
+        timer = threading.Timer(self._timeout, end)
+        timer.start()
         try:
             return decode_reply(calls, self._worker.execute(encode_program(calls)))
         except DoublestepError as error:
+            if is_late.is_set():
+                late = DeadlineError(f"no answer within {self._timeout:g} s", phase=calls[-1].verb)
+                return Reply([], late, 0.0)
             return Reply([], error, 0.0)
+        finally:
+            timer.cancel()
 
     def again(self, *calls: Call, configuration: Configure | None = None) -> Reply:
         """Execute calls on the model as good as new."""
@@ -157,6 +194,7 @@ class _Validation:
         self._trial = trial
         self._description = description
         self._h = step_size
+        self._variables = {v.name: v for v in description.variables}
         self._inputs = tuple(
             v.name for v in description.of(Causality.INPUT) if v.is_continuous_real
         )
@@ -164,7 +202,7 @@ class _Validation:
         self._outputs = tuple(v.name for v in outputs if v.is_continuous_real)
         discrete = tuple(v.name for v in outputs if v.is_discrete)
         self._starts = np.array(
-            [[float(description.variable(name).start or 0.0) for name in self._inputs]]
+            [[float(self._variables[name].start or 0.0) for name in self._inputs]]
         )
         self._begin: tuple[Call, ...] = (
             Initialize(inputs=self._inputs, outputs=self._outputs, discrete_outputs=discrete),
@@ -194,12 +232,11 @@ class _Validation:
     def _initialization(self) -> Finding:
         reply = self._trial.again(*self._begin, GetOutputs(), GetDiscreteOutputs())
         if reply.error is not None:
-            return Finding(
-                "initialize",
-                Grade.PROBLEM,
-                f"{reply.error.phase}: {reply.error.cause}",
-                "it cannot be run with its start values; give others in parameters",
-            )
+            consequence = "it cannot be run with its start values; give others in parameters"
+            if isinstance(reply.error, FatalSlaveError):
+                consequence = "it cannot be run here: the FMU gave up"
+            result = f"{reply.error.phase}: {reply.error.cause}"
+            return Finding("initialize", Grade.PROBLEM, result, consequence)
         y: FloatArray = reply.results[-2]  # type: ignore[assignment]
         bad = [name for name, value in zip(self._outputs, y[0], strict=True) if value - value != 0]
         if bad:
@@ -207,26 +244,32 @@ class _Validation:
                 "initialize", Grade.PROBLEM, f"{bad[0]} is not finite", "a run would not start"
             )
         return Finding(
-            "initialize", Grade.OK, f"{len(self._inputs)} inputs, {len(self._outputs)} outputs"
+            "initialize", Grade.OK, f"inputs: {len(self._inputs)}, outputs: {len(self._outputs)}"
         )
 
     def _steps(self) -> Finding:
+        """Also finds a size of steps that the model takes, for what is tried after this."""
         what = f"{_STEPS} steps of {self._h:g} s"
         reply = self._trial.again(*self._begin, *self._equal_steps(_STEPS))
         problem = _failure(reply)
         if problem is None:
             return Finding(what, Grade.OK, "taken")
-        if _last_status(reply) in (StepStatus.DISCARD, StepStatus.TERMINATED):
+        if not _is_not_completed(reply):
             return Finding(
-                what, Grade.NOTE, problem, "a step that is not completed is tried again, smaller"
+                what, Grade.PROBLEM, problem, "try another --step-size, or look at the FMU's log"
             )
+        for _ in range(_SHRINKS if self._takes_any_step else 0):
+            self._h *= _SHRINK
+            if _failure(self._trial.again(*self._begin, *self._equal_steps(_STEPS))) is None:
+                result = f"{problem}; steps of {self._h:g} s are taken"
+                return Finding(what, Grade.NOTE, result, "steps not completed are made smaller")
         return Finding(
-            what, Grade.PROBLEM, problem, "try another --step-size, or look at the FMU's log"
+            what, Grade.PROBLEM, f"{problem}; no smaller ones either", "try another --step-size"
         )
 
     def _variable_steps(self) -> Finding:
         what = "steps of changing size"
-        if not self._description.capabilities.can_handle_variable_step_size:
+        if not self._takes_any_step:
             fixed = self._description.fixed_step_size
             consequence = "give step_size, or use --estimator none"
             if fixed is not None:
@@ -243,9 +286,12 @@ class _Validation:
         return Finding(what, Grade.NOTE, problem, "give step_size or step_multiple")
 
     def _zero_step(self) -> Finding:
+        what, consequence = "a step of size zero", "none is ever asked for"
+        if self._description.kind == _KEEPS_ZERO_STEPS:
+            return Finding(what, Grade.OK, "does not reach the FMU", consequence)
         reply = self._trial.again(*self._begin, DoStep(0.0, 0.0))
         result = "taken" if _failure(reply) is None else "refused"
-        return Finding("a step of size zero", Grade.OK, result, "none is ever asked for")
+        return Finding(what, Grade.OK, result, consequence)
 
     def _wrong_point(self) -> Finding:
         reply = self._trial.again(
@@ -289,6 +335,8 @@ class _Validation:
         what = "output derivatives"
         if not self._description.capabilities.max_output_derivative_order or not self._outputs:
             return Finding(what, Grade.OK, "none", "input polynomials meet values only")
+        if not self._takes_any_step:
+            return Finding(what, Grade.OK, "not compared: that takes steps of any size")
         h = 1e-3 * self._h
         reply = self._trial.again(
             *self._begin, GetOutputs(1), DoStep(0.0, h), GetOutputs(0), DoStep(h, h), GetOutputs(0)
@@ -298,7 +346,7 @@ class _Validation:
             return Finding(what, Grade.NOTE, problem, "leave them out: derivative_points = 0")
         start, first, second = (r for r in reply.results if isinstance(r, np.ndarray))
         slope = (-3.0 * start[0] + 4.0 * first[0] - second[0]) / (2.0 * h)
-        nominal = [self._description.variable(name).nominal for name in self._outputs]
+        nominal = [self._variables[name].nominal for name in self._outputs]
         scale = np.abs(slope) + np.abs(start[1]) + nominal
         worst = float(np.max(np.abs(slope - start[1]) / scale))
         if worst < 0.05:
@@ -328,18 +376,38 @@ class _Validation:
                 Examine(0.0, self._h),
                 configuration=Configure(state_kind=kind),
             )
+            if isinstance(reply.error, DeadlineError):
+                yield Finding(
+                    what,
+                    Grade.NOTE,
+                    f"{reply.error.cause} {self._in_trial_steps}",
+                    "in a run steps are waited for up to step_timeout",
+                )
+                return
             if reply.error is not None:
-                yield Finding(what, Grade.NOTE, reply.error.cause, "the next way is taken")
+                ended = isinstance(reply.error, SlaveCrashedError)
+                result = reply.error.cause + (f" {self._in_trial_steps}" if ended else "")
+                yield Finding(what, Grade.NOTE, result, "the next way is taken")
                 continue
             examination: Examination = reply.results[-1]  # type: ignore[assignment]
             yield _verdict(what, examination)
-            if examination.state_verdict in (StateVerdict.EXACT, StateVerdict.RESTARTS_SOLVER):
-                yield from _behaviour(examination)
+            if examination.state_verdict is StateVerdict.NOT_TESTED:
                 return
+            if examination.state_verdict in (StateVerdict.EXACT, StateVerdict.RESTARTS_SOLVER):
+                yield from _behaviour(examination, takes_any_step=self._takes_any_step)
+                return
+
+    @property
+    def _in_trial_steps(self) -> str:
+        return f"in trial steps of up to {LARGEST_STEP * self._h:g} s"
+
+    @property
+    def _takes_any_step(self) -> bool:
+        return self._description.capabilities.can_handle_variable_step_size
 
     def _moved(self) -> FloatArray:
         """The start values a little moved: at an equilibrium nothing moves."""
-        nominal = [self._description.variable(name).nominal for name in self._inputs]
+        nominal = [self._variables[name].nominal for name in self._inputs]
         moved: FloatArray = self._starts + 0.01 * np.maximum(np.abs(self._starts), nominal)
         return moved
 
@@ -351,9 +419,11 @@ class _Validation:
         return Finding("terminate and reset", Grade.NOTE, problem, "it is loaded anew instead")
 
     def _equal_steps(self, number: int) -> Iterator[Call]:
-        for i in range(number):
-            yield DoStep(i * self._h, self._h)
+        time = 0.0
+        for _ in range(number):
+            yield DoStep(time, self._h)
             yield GetOutputs()
+            time += self._h
 
 
 def _failure(reply: Reply) -> str | None:
@@ -368,15 +438,19 @@ def _failure(reply: Reply) -> str | None:
     return None
 
 
-def _last_status(reply: Reply) -> StepStatus | None:
-    last = reply.results[-1] if reply.results else None
-    return last.status if isinstance(last, StepResult) and reply.error is None else None
+def _is_not_completed(reply: Reply) -> bool:
+    """Whether the last step was rejected or ended early: a run repeats that, smaller."""
+    if reply.error is not None:
+        return isinstance(reply.error, StepRejectedError)
+    return bool(reply.results) and isinstance(reply.results[-1], StepResult)
 
 
 def _verdict(what: str, examination: Examination) -> Finding:
     verdict, reason = examination.state_verdict, examination.state_reason
     match verdict:
         case StateVerdict.EXACT:
+            if reason:
+                return Finding(what, Grade.NOTE, f"exact to the bit; {reason}", "used")
             return Finding(what, Grade.OK, "exact to the bit", "steps can be taken back")
         case StateVerdict.RESTARTS_SOLVER:
             result = f"repeats, but restarts the solver: {reason} ({examination.difference:.1g})"
@@ -387,7 +461,10 @@ def _verdict(what: str, examination: Examination) -> Finding:
             return Finding(what, Grade.NOTE, f"{verdict}: {reason}", "the next way is taken")
 
 
-def _behaviour(examination: Examination) -> Iterator[Finding]:
+def _behaviour(examination: Examination, *, takes_any_step: bool) -> Iterator[Finding]:
+    """What was tried with steps of several sizes, if the model takes them."""
+    if not takes_any_step:
+        return
     clock = examination.internal_clock
     if clock is not None:
         yield Finding(
@@ -396,6 +473,7 @@ def _behaviour(examination: Examination) -> Iterator[Finding]:
             f"outputs move only at multiples of {clock:g} s",
             "communication steps are multiples of that",
         )
+        return
     dependence = examination.step_dependence
     if dependence > 1.0:
         largest = examination.largest_substep

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ from slave_node.inspection import description_tables
 from slave_node.loading import load_slave
 
 Load = Callable[..., Slave]
+
+pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
 
 CONTINUOUS = {"chassis": ("x_w", "v_w"), "wheel": ("x_c", "v_c")}
 
@@ -579,6 +582,22 @@ def test_a_missing_licence_is_told_in_the_words_of_the_fmu(load: Load) -> None:
     """The FMU's own log lines come with the refusal."""
     with pytest.raises(ModelError, match=r"licence_error\.fmu: fmi2Instantiate: .*log: .*licence"):
         load("licence_error")
+
+
+def test_a_tool_that_is_not_here_is_the_remedy(capability_dir: Path, tmp_path: Path) -> None:
+    """An FMU that needs its tool, and cannot be instantiated, says which tool it is."""
+    fmu = tmp_path / "needs_tool.fmu"
+    with ZipFile(capability_dir / "licence_error.fmu") as source, ZipFile(fmu, "w") as copy:
+        for entry in source.infolist():
+            data = source.read(entry)
+            if entry.filename == "modelDescription.xml":
+                data = data.replace(b'needsExecutionTool="false"', b'needsExecutionTool="true"')
+                data = data.replace(b" modelName", b' generationTool="Workbench 7" modelName')
+            copy.writestr(entry, data)
+    with pytest.raises(ModelError) as caught:
+        load_fmu(fmu, tmp_path / "scratch", "tool")
+    assert "licence not found" in caught.value.cause
+    assert caught.value.remedy == "it needs Workbench 7 installed on this host"
 
 
 def test_the_need_of_an_execution_tool_is_remarked(load: Load) -> None:

@@ -484,6 +484,19 @@ def changed(fmu_dir: Path, path: Path, *changes: tuple[str, str]) -> Path:
     return packed(path, {**entries, "modelDescription.xml": xml.encode()})
 
 
+def test_an_fmu_for_one_instance_per_process_has_one(
+    fmu_dir: Path, tmp_path: Path, load: Load
+) -> None:
+    """The second is refused with a remedy, until the first is gone."""
+    once = "canBeInstantiatedOnlyOncePerProcess"
+    fmu = changed(fmu_dir, tmp_path / "wheel.fmu", (f'{once}="false"', f'{once}="true"'))
+    first = load(fmu)
+    with pytest.raises(ModelError, match=r"only once per process.*leave out --in-process"):
+        load(fmu)
+    first.close()
+    start(load(fmu))
+
+
 FMI_4 = """<?xml version="1.0"?>
 <fmiModelDescription fmiVersion="4.0" modelName="m" instantiationToken="{0}">
 <CoSimulation modelIdentifier="m"/><ModelVariables/><ModelStructure/>

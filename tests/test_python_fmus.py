@@ -5,6 +5,7 @@ Their code runs in the interpreter of the process that loads them, which is one 
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import zipfile
@@ -115,7 +116,7 @@ def load(tmp_path: Path) -> Iterator[Load]:
             inputs=inputs,
             outputs=outputs,
         )
-        slaves[-1].set_inputs(np.array([[1.0]]))
+        slaves[-1].set_inputs(np.ones((1, len(inputs))))
         slaves[-1].exit_initialization_mode()
         return slaves[-1]
 
@@ -163,6 +164,46 @@ def test_without_the_package_the_build_says_what_to_install(
     script = python_fmu_build.FOLDER / "wheel.py"
     with pytest.raises(python_fmu_build.BuildError, match="No module named doublestep_absent"):
         python_fmu_build.build_model(script, tmp_path, "doublestep_absent")
+
+
+DECAY = """
+from pythonfmu3 import (
+    Float64, Fmi3Causality, Fmi3Initial, Fmi3SlaveBase, Fmi3Variability, ModelExchange
+)
+
+
+class Decay(Fmi3SlaveBase, ModelExchange):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.modelName = "decay"
+        self.time, self.x, self.slope = 0.0, 1.0, 0.0
+        for name, causality, how in (
+            ("time", Fmi3Causality.independent, {}),
+            ("x", Fmi3Causality.output, {"start": 1.0, "initial": Fmi3Initial.exact}),
+            ("slope", Fmi3Causality.local, {"derivative": 1}),
+        ):
+            variability = Fmi3Variability.continuous
+            self.register_variable(
+                Float64(name, causality=causality, variability=variability, **how)
+            )
+
+    def get_continuous_state_derivatives(self):
+        self.slope = -self.x
+        return [self.slope]
+"""
+
+
+def test_model_exchange_in_python_is_integrated(
+    python_fmu_build: ModuleType, tmp_path: Path, load: Load
+) -> None:
+    """CVode integrates x' = -x, and the state comes back to the bit."""
+    script = tmp_path / "decay.py"
+    script.write_text(DECAY, encoding="utf-8")
+    slave = load(python_fmu_build.build_model(script, tmp_path, "pythonfmu3"), (), ("x",))
+    assert slave.description.kind == "FMI 3.0 model exchange"
+    assert examine(slave, 0.0, 0.1).state_verdict is StateVerdict.EXACT
+    slave.do_step(0.0, 1.0, False)
+    assert slave.get_outputs(0)[0, 0] == pytest.approx(math.exp(-1.0), rel=1e-5)
 
 
 # ---- One interpreter ----------------------------------------------------------------------------

@@ -35,6 +35,9 @@ _MISSING_LIBRARY = re.compile(r"([^\s:]+): cannot open shared object file")
 
 ADDRESS = ctypes.c_void_p
 
+_only_instances: set[str] = set()
+"""Tokens of the FMUs here that declare canBeInstantiatedOnlyOncePerProcess."""
+
 T = TypeVar("T")
 
 
@@ -71,6 +74,11 @@ class FmuInstance(ABC):
         check_binary(
             model.fmu, model.directory, model.interface.model_identifier, self.platform_folder
         )
+        if model.interface.is_once_per_process and model.token in _only_instances:
+            raise ModelError(
+                f"{model.fmu}: can be instantiated only once per process, and is already",
+                remedy="give each slave a process of its own: leave out --in-process",
+            )
         self.fmu = self._load(name)
         try:
             with own_modules(model.fmu, model.directory):
@@ -83,6 +91,8 @@ class FmuInstance(ABC):
                 remedy=self._remedy(),
             ) from error
         self.component: int = self.fmu.component
+        if model.interface.is_once_per_process:
+            _only_instances.add(model.token)
         try:
             self._load_functions()
         except AttributeError as error:
@@ -300,6 +310,7 @@ class FmuInstance(ABC):
                 with suppress(FMICallException):
                     fmu.freeInstance()
             forget_modules(self.model.directory)
+            _only_instances.discard(self.model.token)
 
 
 def reference_array(places: Sequence[Place]) -> np.ndarray[Any, np.dtype[np.uint32]]:

@@ -25,6 +25,7 @@ class Interface:
         input_derivatives: how it follows polynomial inputs.
         fixed_step_size: the only communication step size that it takes [s], None: any.
         needs_execution_tool: whether it is only an adapter to a tool.
+        is_once_per_process: whether a process may hold one instance only.
         has_event_mode: FMI 3.0, co-simulation.
         saves_state: whether the FMU itself saves its state.
         continuous_states, event_indicators: how many there are (model exchange of FMI 2.0; FMI 3.0
@@ -40,6 +41,7 @@ class Interface:
     input_derivatives: InputDerivatives = InputDerivatives.NONE
     fixed_step_size: float | None = None
     needs_execution_tool: bool = False
+    is_once_per_process: bool = False
     has_event_mode: bool = False
     saves_state: bool = False
     continuous_states: int = 0
@@ -81,6 +83,7 @@ def interface_1(model_description: Any, root: Element) -> Interface:
         ),
         input_derivatives=_native(can_interpolate),
         needs_execution_tool=root.find("./Implementation/CoSimulation_Tool") is not None,
+        is_once_per_process=declared.get("canBeInstantiatedOnlyOncePerProcess") in _YES,
     )
 
 
@@ -110,6 +113,7 @@ def interface_2(model_description: Any, root: Element) -> Interface:
         input_derivatives=_native(bool(slave.canInterpolateInputs)),
         fixed_step_size=None if has_variable_steps else default_step_size(model_description),
         needs_execution_tool=bool(slave.needsExecutionTool),
+        is_once_per_process=bool(slave.canBeInstantiatedOnlyOncePerProcess),
     )
 
 
@@ -140,6 +144,7 @@ def interface_3(model_description: Any, root: Element) -> Interface:
         input_derivatives=_native(bool(intermediate)),
         fixed_step_size=None if has_variable_steps or fixed is None else float(fixed),
         needs_execution_tool=bool(slave.needsExecutionTool),
+        is_once_per_process=bool(slave.canBeInstantiatedOnlyOncePerProcess),
         has_event_mode=bool(slave.hasEventMode),
         intermediate_inputs=intermediate,
     )
@@ -176,6 +181,7 @@ def _model_exchange(version: int, model_description: Any) -> Interface:
         ),
         input_derivatives=InputDerivatives.NATIVE,
         needs_execution_tool=bool(model.needsExecutionTool),
+        is_once_per_process=bool(model.canBeInstantiatedOnlyOncePerProcess),
         saves_state=bool(model.canGetAndSetFMUstate),
         continuous_states=int(model_description.numberOfContinuousStates),
         event_indicators=int(model_description.numberOfEventIndicators or 0),
