@@ -43,7 +43,7 @@ class Habits:
     def __init__(self) -> None:
         self.situation: Situation = (0, ())
         self._followers: dict[Situation, Event] = {}
-        self._are_restored: dict[Situation, bool] = {}
+        self._uses: dict[Situation, Event | None] = {}
 
     def note(self, event: Event, saved: int) -> None:
         """An event, and how many states are saved at it."""
@@ -57,11 +57,13 @@ class Habits:
         """The event that followed here the last time; None: there was no last time."""
         return self._followers.get(self.situation)
 
-    def note_use(self, situation: Situation, *, is_restored: bool) -> None:
-        """Whether a state that was saved in a situation was restored before it was freed."""
-        self._are_restored[situation] = is_restored
+    def note_use(self, situation: Situation, use: Event | None) -> None:
+        """What a state was first used for that was saved in a situation: ``RESTORE``, ``GIVE_UP``.
 
-    @property
-    def saves_for_nothing(self) -> bool:
-        """Whether the last state that was saved in this situation was never restored."""
-        return not self._are_restored.get(self.situation, True)
+        None: it was freed.
+        """
+        self._uses[situation] = use
+
+    def use(self, situation: Situation) -> Event | None:
+        """That of the last state saved in this situation; of the first one it is ``GIVE_UP``."""
+        return self._uses.get(situation, Event.GIVE_UP)

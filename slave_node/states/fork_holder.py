@@ -160,7 +160,8 @@ class _Holder:
             self._channel = Channel(connection)
             self._children = set()
             reopen(readers)
-            self._channel.send(Message.DONE, PROCESS.pack(os.getpid()))
+            with suppress(OSError):  # given up already; but copies of it may be asked for
+                self._channel.send(Message.DONE, PROCESS.pack(os.getpid()))
 
     def _bury(self) -> None:
         """Only our own: those of the model are the model's."""

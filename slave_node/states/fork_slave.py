@@ -74,14 +74,14 @@ class _State:
         origin: a process that stands still as long as a state has it for its origin.
         trail: from there to the state.
         copy: a process that stands at the state; ``origin`` may be one too.
-        is_restored: whether it was, ever.
+        is_used: whether it was restored, ever.
     """
 
     situation: Situation
     origin: HeldProcess
     trail: Trail
     copy: HeldProcess | None = None
-    is_restored: bool = False
+    is_used: bool = False
 
 
 class ForkSlave(Slave):
@@ -196,7 +196,7 @@ class ForkSlave(Slave):
         self._drop_ahead()
         self._habits.note(Event.STEP if kind is Message.STEP else Event.RUN, len(self._saved))
         expected = self._habits.expected
-        if expected in (Event.RESTORE, Event.GIVE_UP):
+        if expected is Event.RESTORE or self._is_latest_for_restores():
             self._prepare_latest()
         copy_behind = expected is Event.SAVE and self._needs_copy()
         trail, self._trail = self._trail, None
@@ -400,6 +400,7 @@ class ForkSlave(Slave):
         """See `Slave`."""
         saved = self._state(state)
         self._habits.note(Event.RESTORE, len(self._saved))
+        self._note_use(saved, Event.RESTORE)
         copy = self._take_copy(saved)
         self._latest = saved
         self._go_on_with(copy, saved)
@@ -409,11 +410,12 @@ class ForkSlave(Slave):
         saved = self._state(state)
         self._habits.note(Event.GIVE_UP, len(self._saved))
         is_last = not any(s.origin is saved.origin for s in self._saved - {saved})
-        if saved.copy is None and not saved.trail.tasks and is_last:
-            saved.origin.meet()
-            self._note_use(saved, is_restored=True)
+        self._note_use(saved, Event.GIVE_UP)
+        if is_last and not saved.trail.tasks:
             self._saved.discard(saved)
             self._go_on_with(saved.origin, None)
+            if saved.copy is not None:
+                self._end_process(saved.copy)
         else:
             self._go_on_with(self._take_copy(saved), saved)
             self._free(saved)
@@ -439,7 +441,7 @@ class ForkSlave(Slave):
 
     def _needs_copy(self) -> bool:
         """Whether a state that is saved here needs a process of its own."""
-        return self._trail is None or not self._habits.saves_for_nothing
+        return self._trail is None or self._habits.use(self._habits.situation) is not None
 
     def _copy_of_active(self, holder: HeldProcess) -> HeldProcess:
         """The one that was made ahead, or a new one; waited for only if there was none before."""
@@ -464,29 +466,41 @@ class ForkSlave(Slave):
                 state.copy = _copy_from_origin(state)
 
     def _take_copy(self, state: _State) -> HeldProcess:
-        """A process that stands at the state.
+        """A process that stands at the state, or is on its way there if it was made ahead.
 
         Raises:
             SlaveError: there is none, as `HeldProcess.meet` says.
         """
         copy, state.copy = state.copy, None
+        if copy is not None:  # whether it is there will be seen when it is asked
+            return copy
         try:
-            copy = copy or _copy_from_origin(state)
+            copy = _copy_from_origin(state)
         except OSError:
             raise state.origin.death() from None
-        if copy in self._unconfirmed:
-            self._unconfirmed.remove(copy)
         _meet(copy)
-        self._note_use(state, is_restored=True)
         return copy
 
-    def _note_use(self, state: _State, *, is_restored: bool) -> None:
-        state.is_restored = is_restored
-        self._habits.note_use(state.situation, is_restored=is_restored)
+    def _note_use(self, state: _State, use: Event | None) -> None:
+        """The first use counts."""
+        if not state.is_used:
+            state.is_used = True
+            self._habits.note_use(state.situation, use)
+
+    def _is_latest_for_restores(self) -> bool:
+        """Whether the state saved last, and not yet used, is likely to be restored and kept."""
+        state = self._latest
+        return (
+            state is not None
+            and not state.is_used
+            and self._habits.use(state.situation) is Event.RESTORE
+        )
 
     def _go_on_with(self, holder: HeldProcess, state: _State | None) -> None:
         """``state``: at which it stands, if there is still such a state."""
         self._drop_active()
+        if holder in self._unconfirmed:
+            self._unconfirmed.remove(holder)
         self._active = holder
         self._origin = state.origin if state is not None else None
         self._trail = state.trail if state is not None else None
@@ -495,8 +509,7 @@ class ForkSlave(Slave):
 
     def _free(self, state: _State) -> None:
         self._saved.discard(state)
-        if not state.is_restored:
-            self._note_use(state, is_restored=False)
+        self._note_use(state, None)
         if state.copy is not None:
             self._end_process(state.copy)
         if not any(other.origin is state.origin for other in self._saved):

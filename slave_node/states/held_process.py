@@ -48,7 +48,9 @@ class HeldProcess:
 
         Raises:
             EOFError, OSError: it is gone.
+            SlaveError: it never was there, see `meet`.
         """
+        self.meet()
         return self._channel.receive()
 
     def wait(self, timeout: float) -> bool:
