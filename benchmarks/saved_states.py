@@ -86,8 +86,7 @@ def _single_calls(model: str) -> list[tuple[str, str, str, str]]:
                 slave.exit_initialization_mode()
                 times[kind] = _medians(slave)
                 if kind == "fork":
-                    holders = psutil.Process().children(recursive=True)
-                    size = max(p.memory_info().rss for p in holders) / 2**20
+                    size = max(map(_resident, psutil.Process().children(recursive=True)))
             finally:
                 slave.close()
     return [
@@ -99,6 +98,14 @@ def _single_calls(model: str) -> list[tuple[str, str, str, str]]:
         )
         for what, fork in times["fork"].items()
     ]
+
+
+def _resident(process: psutil.Process) -> float:
+    """Memory of a process [MiB]; 0 if it has just ended."""
+    try:
+        return float(process.memory_info().rss) / 2**20
+    except psutil.NoSuchProcess:
+        return 0.0
 
 
 def _medians(slave) -> dict[str, float]:

@@ -231,7 +231,8 @@ class ForkSlave(Slave):
         copies, self._unconfirmed = self._unconfirmed, []
         for copy in copies:
             if copy.wait(0.0):
-                copy.meet()
+                with suppress(SlaveCrashedError):  # that matters if it is ever restored
+                    copy.meet()
 
     def _run(self, *calls: Call) -> list[object]:
         """Results of ``calls``, after those that were put off.
@@ -363,9 +364,11 @@ class ForkSlave(Slave):
     def close(self) -> None:
         """See `Slave`. Ends all processes."""
         if self._active is not None:
-            with suppress(OSError):  # it died of that
+            with suppress(OSError, SlaveError):  # it died of that, or never was there
                 self._active.send(Message.CLOSE)
-                self._active.wait(_CLOSE_TIME)
+                if self._active.wait(_CLOSE_TIME):
+                    self._active.meet()
+                    self._active.wait(_CLOSE_TIME)
         self._end()
 
     def _end(self) -> None:
