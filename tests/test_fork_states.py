@@ -37,6 +37,8 @@ from protocol.errors import (
 )
 from protocol.slave import Causality, Slave, SlaveDescription, StateKind, StepStatus, VariableType
 from slave_node.examination import examine
+from slave_node.states.fork_habits import Event, Habits
+from slave_node.states.held_process import HeldProcess
 from slave_node.worker import ModelReference, WorkerProcess
 from tests.quarter_car_case import DISPLACEMENT
 from tests.state_programs import BOUND, MODELS, begin, fragile, loaded, wait_until, wander, wheel
@@ -252,7 +254,7 @@ def test_freed_states_and_closed_slaves_leave_no_process(fmu_dir: Path) -> None:
     """Not even a dead one that nobody buried."""
     with wheel(fmu_dir, "fork") as slave:
         states = [slave.get_state() for _ in range(5)]
-        assert len(family()) == 7
+        wait_until(lambda: len(family()) == 7)
         for state in states:
             slave.free_state(state)
         slave.do_step(0.0, 1e-3, True)
@@ -300,6 +302,103 @@ def test_nothing_leaks(fmu_dir: Path, kind: str, cycles: int) -> None:
     assert before is not None
     assert after[:2] == before[:2]
     assert after[2] - before[2] < 2 * 2**20
+
+
+@pytest.fixture
+def no_step_is_dear(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However slow this machine is just now, steps are done again rather than copied."""
+    monkeypatch.setattr("slave_node.states.fork_trail._LONGEST", BOUND)
+
+
+@pytest.mark.usefixtures("no_step_is_dear")
+@pytest.mark.parametrize("estimator", ["mod", "rich"])
+def test_a_double_step_copies_each_process_once(
+    fmu_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, estimator: str
+) -> None:
+    """Three solutions need two copies; that of a state which is never restored is spared."""
+    copies = []
+    copy = HeldProcess.copy
+    monkeypatch.setattr(HeldProcess, "copy", lambda self: copies.append(self) or copy(self))
+    system = car(fmu_dir, "fork").with_simulation(initial_step_size=1e-3, largest_step_size=2e-3)
+    summary = simulate(
+        system, output=tmp_path / "r", estimator=estimator, in_process=True, stop_time=0.4
+    ).summary
+    accepted = summary["communication_steps"] // 2
+    assert accepted > 90
+    assert len(copies) < 1.2 * 2 * accepted + 4 * 2 * summary["rejected_double_steps"]
+
+
+def saved_by_a_trail(slave: Slave) -> tuple[object, float]:
+    """A state for which there is no process, as none before it was restored; and its time."""
+    state: object = None
+    for time in range(6):
+        before, state = state, slave.get_state()
+        if before is not None:
+            slave.free_state(before)
+        slave.do_step(1e-3 * time, 1e-3, True)
+        slave.get_outputs(0)
+    last = slave.get_state()
+    slave.free_state(state)
+    wait_until(lambda: len(family()) == 3)  # keeper, slave, origin
+    return last, 6e-3
+
+
+@pytest.mark.usefixtures("no_step_is_dear")
+def test_a_state_that_is_not_expected_to_be_restored_is_restored_all_the_same(
+    fmu_dir: Path,
+) -> None:
+    """By doing again what was done since an earlier one, to the same bits, twice."""
+    with wheel(fmu_dir, "fork") as slave:
+        slave.set_inputs(np.array([[0.1, 0.0], [0.2, 1.0]]))
+        state, time = saved_by_a_trail(slave)
+        ends = []
+        for restore in (None, slave.set_state, slave.set_state_and_free):
+            if restore is not None:
+                restore(state)
+            slave.do_step(time, 1e-3, True)
+            ends.append(slave.get_outputs(0).tobytes())
+        wait_until(lambda: len(family()) == 2)
+    assert len(set(ends)) == 1
+
+
+@pytest.mark.usefixtures("no_step_is_dear")
+def test_a_model_that_does_not_repeat_is_not_restored_elsewhere(tmp_path: Path) -> None:
+    """What it reads has changed behind its back: that is an error and no other state."""
+    numbers = tmp_path / "numbers"
+    numbers.write_text("".join(f"{number:7d}\n" for number in range(1000)))
+    with loaded(f"{MODELS}:Reader", "fork", outputs=("y",), file=str(numbers)) as slave:
+        state, _ = saved_by_a_trail(slave)
+        with numbers.open("r+") as file:
+            file.write("".join(f"{number:7d}\n" for number in range(1000, 2000)))
+        with pytest.raises(SlaveError, match="the model does not repeat"):
+            slave.set_state(state)
+
+
+def test_habits_know_what_came_the_last_time() -> None:
+    """In the same situation: the same events and as many states as before; else nothing."""
+    habits = Habits()
+    for event, expected in (
+        (Event.SAVE, None),
+        (Event.STEP, None),
+        (Event.GIVE_UP, None),
+        (Event.STEP, None),
+        (Event.SAVE, Event.STEP),
+        (Event.STEP, Event.GIVE_UP),
+    ):
+        habits.note(event, 1)
+        assert habits.expected is expected
+    habits.note(Event.STEP, 2)
+    assert habits.expected is None
+
+
+def test_habits_know_what_states_were_used_for() -> None:
+    """Of the first one in a situation the dearest is expected: that it will be restored."""
+    habits = Habits()
+    situation = habits.situation
+    assert habits.use(situation) is Event.GIVE_UP
+    for use in (None, Event.RESTORE):
+        habits.note_use(situation, use)
+        assert habits.use(situation) is use
 
 
 # ---- Deaths -------------------------------------------------------------------------------------
@@ -393,8 +492,8 @@ def worker_in_an_endless_step(
 def test_a_worker_that_is_killed_in_an_endless_step_leaves_nobody(tmp_path: Path) -> None:
     """As the node does it when the master says abort."""
     worker, _, ends = worker_in_an_endless_step(tmp_path)
+    wait_until(lambda: len(living(family())) == 4)  # worker, keeper, state, slave
     processes = family()
-    assert len(processes) == 4  # worker, keeper, state, slave
     worker.kill()
     wait_until(lambda: not living(processes))
     wait_until(lambda: bool(ends))

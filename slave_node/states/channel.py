@@ -9,7 +9,11 @@ from enum import IntEnum
 from struct import Struct
 
 PROCESS = Struct("<q")
-"""A process id, as it answers `Message.FORK`."""
+"""A process id, with which a holder says that it is there."""
+
+DURATION = Struct("<d")
+"""Seconds that the model took: stands before the answers of `Message.STEP` and `Message.PROGRAM`
+that are ``DONE``."""
 
 _HEADER = Struct("<BQ")
 _CHUNK = 2**20
@@ -20,7 +24,7 @@ class Message(IntEnum):
 
     ``LOAD``: load the model that a map tells. ``STEP``: take a step, see ``step_message.py``.
     ``PROGRAM``: execute any other calls. ``FORK``: make a copy that serves the socket that
-    follows. ``CLOSE``: free the model.
+    follows; it is answered on that socket, by the copy. ``CLOSE``: free the model.
     """
 
     LOAD = 0

@@ -31,7 +31,7 @@ class HolderFamily:
     """The keeper and the holders below it; see ``fork_keeper.py``.
 
     Attributes:
-        first: the channel to the first holder, which holds no model yet.
+        first: our end of the socket to the first holder, which holds no model yet.
         first_process: its process id.
 
     Raises:
@@ -60,11 +60,11 @@ class HolderFamily:
             os.close(obituaries)
         self._group = 0
         self._is_closed = False
-        self.first = self.channel(ours)
+        self.first = ours
         try:
-            _, process = self.first.receive()
+            _, process = self.channel(ours).receive()
         except (EOFError, OSError):
-            self.first.close()
+            ours.close()
             self.close()
             raise SlaveCrashedError("the process for the model did not come up") from None
         (self.first_process,) = PROCESS.unpack(process)
@@ -80,11 +80,11 @@ class HolderFamily:
             self._kill()
 
     def death(self, process: int) -> str:
-        """How a holder died whose channel is closed, in words."""
+        """How a holder died whose channel is closed, in words; 0 is one that nobody has met."""
         deadline = monotonic() + _OBITUARY_TIME
         reader = select.poll()
         reader.register(self._obituaries, select.POLLIN)
-        while (left := deadline - monotonic()) > 0.0 and reader.poll(left * 1e3):
+        while process and (left := deadline - monotonic()) > 0.0 and reader.poll(left * 1e3):
             record = os.read(self._obituaries, OBITUARY.size)
             if len(record) < OBITUARY.size:  # nobody is left to write one
                 break

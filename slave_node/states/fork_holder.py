@@ -12,7 +12,9 @@ import gc
 import os
 import signal
 import socket
+from contextlib import suppress
 from pathlib import Path
+from time import perf_counter
 from typing import NoReturn
 
 from protocol.calls import Configure, Reply
@@ -21,7 +23,7 @@ from protocol.errors import DoublestepError, SlaveError
 from protocol.slave import CallExecutor, Slave
 from slave_node.executor import Executor
 from slave_node.loading import load_model
-from slave_node.states.channel import PROCESS, Channel, Message
+from slave_node.states.channel import DURATION, PROCESS, Channel, Message
 from slave_node.states.fork_hindrances import ForkHindrances, reopen
 from slave_node.states.fork_keeper import report
 from slave_node.states.step_message import execute_step
@@ -72,7 +74,8 @@ def _execute(executor: CallExecutor, program: bytes) -> bytes:
         calls = decode_program(program)
     except DoublestepError as error:
         return encode_error(error)
-    return encode_reply(executor.execute(calls))
+    reply = executor.execute(calls)
+    return encode_reply(reply._replace(compute_time=0.0))  # the same whenever it is done again
 
 
 class _Holder:
@@ -107,7 +110,7 @@ class _Holder:
                     case Message.STEP:
                         self._step(payload)
                     case Message.PROGRAM:
-                        self._channel.send(Message.DONE, _execute(self._executor, payload))
+                        self._run(payload)
                     case Message.FORK:
                         self._fork(self._channel.receive_socket())
                     case _:
@@ -125,33 +128,40 @@ class _Holder:
             signal.pthread_sigmask(signal.SIG_BLOCK, _CHILD)
 
     def _step(self, payload: bytes) -> None:
+        begin = perf_counter()
         try:
             answer = execute_step(self._slave, payload)
         except DoublestepError as error:
             self._channel.send(Message.REFUSED, encode_error(error))
         else:
-            self._channel.send(Message.DONE, answer)
+            self._channel.send(Message.DONE, DURATION.pack(perf_counter() - begin) + answer)
+
+    def _run(self, payload: bytes) -> None:
+        begin = perf_counter()
+        answer = _execute(self._executor, payload)
+        self._channel.send(Message.DONE, DURATION.pack(perf_counter() - begin) + answer)
 
     def _fork(self, connection: socket.socket) -> None:
-        """Make a copy that serves ``connection``."""
+        """Make a copy that serves ``connection``; it answers, or we say there why there is none."""
         ours = {self._channel.fileno(), connection.fileno()}
         try:
             readers = self._hindrances.check(ours)
             self._flush(None)  # what the model has printed is not to be printed by both
             child = os.fork()
         except (OSError, SlaveError) as error:
-            connection.close()
-            self._channel.send(Message.REFUSED, encode_error(_refusal(error)))
+            with connection, suppress(OSError):  # nobody wants the copy any more
+                Channel(connection).send(Message.REFUSED, encode_error(_refusal(error)))
             return
         if child:
             connection.close()
             self._children.add(child)
-            self._channel.send(Message.DONE, PROCESS.pack(child))
         else:
             self._channel.close()  # else nobody would notice when the original dies
             self._channel = Channel(connection)
             self._children = set()
             reopen(readers)
+            with suppress(OSError):  # given up already; but copies of it may be asked for
+                self._channel.send(Message.DONE, PROCESS.pack(os.getpid()))
 
     def _bury(self) -> None:
         """Only our own: those of the model are the model's."""

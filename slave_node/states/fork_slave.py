@@ -1,13 +1,18 @@
 """`ForkSlave`: the model lives in a process of its own, and a fork of that is a saved state.
 
 To save is to let the holder fork; the copy waits, frozen, for what never comes unless the state is
-restored. To restore is to go on with the copy: with the copy itself if the state is given up with
-that, else with a fork of it. The process that was the slave before ends then.
+restored. To restore is to go on with the copy; the process that was the slave before ends then.
+What makes that dear is the copies, so that there are as few as can be, and at the best time:
+
+- A copy is asked for and not waited for, and where habit says that one will be needed, beforehand:
+  right behind the step before it, so that it is made while the results are on their way.
+- A state that is restored and stays saved gives its copy away. It can still be had, as each state
+  that habit says will not be restored at all: by the *trail* from an earlier copy, the *origin*,
+  that did not move. Another copy of that does the same again. Trails are short, see `Trail`.
 """
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -31,7 +36,6 @@ from protocol.calls import (
 )
 from protocol.codec import decode_reply, encode_map, encode_program
 from protocol.errors import (
-    DoublestepError,
     FatalSlaveError,
     SlaveCrashedError,
     SlaveError,
@@ -39,8 +43,11 @@ from protocol.errors import (
 )
 from protocol.signals import FloatArray
 from protocol.slave import Slave, SlaveDescription, StartValue, StateKind
-from slave_node.states.channel import PROCESS, Channel, Message
+from slave_node.states.channel import DURATION, Message
 from slave_node.states.fork_family import HolderFamily
+from slave_node.states.fork_habits import Event, Habits, Situation
+from slave_node.states.fork_trail import START, Task, Trail
+from slave_node.states.held_process import HeldProcess, refusal
 from slave_node.states.step_message import decode_stepped, encode_step
 
 _CLOSE_TIME = 0.5
@@ -58,12 +65,23 @@ class HeldModel:
     configuration: Configure = field(default_factory=Configure)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Holder:
-    """A process that holds the model: the slave itself, or a saved state."""
+@dataclass(slots=True, eq=False)
+class _State:
+    """A saved state.
 
-    channel: Channel
-    process: int
+    Attributes:
+        situation: in which it was saved.
+        origin: a process that stands still as long as a state has it for its origin.
+        trail: from there to the state.
+        copy: a process that stands at the state; ``origin`` may be one too.
+        is_used: whether it was restored, ever.
+    """
+
+    situation: Situation
+    origin: HeldProcess
+    trail: Trail
+    copy: HeldProcess | None = None
+    is_used: bool = False
 
 
 class ForkSlave(Slave):
@@ -85,13 +103,22 @@ class ForkSlave(Slave):
         self._model = model
         self._reason = reason
         self._loads = count()
-        self._saved: set[_Holder] = set()
+        self._saved: set[_State] = set()
+        self._habits = Habits()
         self._load()
 
     def _load(self) -> None:
         """Start with a new family; there is none."""
         self._family = HolderFamily()
-        self._active: _Holder | None = _Holder(self._family.first, self._family.first_process)
+        self._active: HeldProcess | None = HeldProcess(
+            self._family, self._family.first, self._family.first_process
+        )
+        self._origin: HeldProcess | None = None
+        self._trail: Trail | None = None
+        self._ahead: HeldProcess | None = None
+        self._latest: _State | None = None
+        self._unconfirmed: list[HeldProcess] = []
+        self._has_forked = False
         self._forget()
         try:
             self.description = self._describe()
@@ -113,7 +140,7 @@ class ForkSlave(Slave):
                 "configuration": encode_program([model.configuration]),
             }
         )
-        _, answer = self._ask(Message.LOAD, message)
+        _, answer = self._exchange(Message.LOAD, message)
         reply = decode_reply([Describe()], answer)
         if reply.error is not None:
             raise reply.error
@@ -130,7 +157,7 @@ class ForkSlave(Slave):
 
     # ---- Calls to the holder ------------------------------------------------------------------
 
-    def _holder(self) -> _Holder:
+    def _holder(self) -> HeldProcess:
         if self._active is None:
             raise SlaveCrashedError(
                 "the process that held the model is gone",
@@ -138,33 +165,74 @@ class ForkSlave(Slave):
             )
         return self._active
 
-    def _ask(self, kind: Message, payload: bytes) -> tuple[Message, bytes]:
-        """What the holder answers.
+    def _exchange(
+        self, kind: Message, payload: bytes, *, copy_behind: bool = False
+    ) -> tuple[Message, bytes]:
+        """What the holder answers; with ``copy_behind`` it then makes a copy.
 
         Raises:
             SlaveCrashedError: it died.
         """
         holder = self._holder()
         try:
-            holder.channel.send(kind, payload)
-            return holder.channel.receive()
+            holder.send(kind, payload)
+            if copy_behind:
+                self._ahead = holder.copy()
+            return holder.receive()
         except (EOFError, OSError):
             self._drop_active()
-            raise self._died(holder) from None
+            raise holder.death() from None
         except BaseException:  # Ctrl-C: what it answers would be for nobody
             self._drop_active()
             raise
 
+    def _ask(self, kind: Message, payload: bytes) -> tuple[Message, bytes]:
+        """Let the holder do something, and prepare what is likely to come after it.
+
+        Raises:
+            SlaveCrashedError: it died.
+            SlaveError: a state that was to be saved before could not be.
+        """
+        self._drop_ahead()
+        self._habits.note(Event.STEP if kind is Message.STEP else Event.RUN, len(self._saved))
+        expected = self._habits.expected
+        if expected is Event.RESTORE or self._is_latest_for_restores():
+            self._prepare_latest()
+        copy_behind = expected is Event.SAVE and self._needs_copy()
+        trail, self._trail = self._trail, None
+        answer_kind, answer = self._exchange(kind, payload, copy_behind=copy_behind)
+        self._confirm()
+        if answer_kind is Message.DONE:
+            (duration,) = DURATION.unpack_from(answer)
+            answer = answer[DURATION.size :]
+            if trail is not None:
+                self._trail = trail.after(Task(kind, payload, answer), duration)
+        return answer_kind, answer
+
     def _drop_active(self) -> None:
         """Let the process that is the slave end, unless it has already."""
+        self._drop_ahead()
         if self._active is not None:
-            self._active.channel.close()
+            self._active.close()
             self._active = None
 
-    def _died(self, holder: _Holder) -> SlaveCrashedError:
-        return SlaveCrashedError(
-            f"the process that held the model {self._family.death(holder.process)}"
-        )
+    def _drop_ahead(self) -> None:
+        """The slave does not stand any more where its copy was made."""
+        if self._ahead is not None:
+            self._ahead.close()
+            self._ahead = None
+
+    def _confirm(self) -> None:
+        """After an answer: copies that were asked for before would have been refused by now.
+
+        Raises:
+            SlaveError: one was.
+        """
+        copies, self._unconfirmed = self._unconfirmed, []
+        for copy in copies:
+            if copy.wait(0.0):
+                with suppress(SlaveCrashedError):  # that matters if it is ever restored
+                    copy.meet()
 
     def _run(self, *calls: Call) -> list[object]:
         """Results of ``calls``, after those that were put off.
@@ -254,7 +322,7 @@ class ForkSlave(Slave):
         order = self._order
         kind, answer = self._ask(Message.STEP, encode_step(inputs, step, order))
         if kind is not Message.DONE:
-            raise _refusal(answer)
+            raise refusal(answer)
         result, self._outputs = decode_stepped(answer, order)
         return result
 
@@ -296,9 +364,11 @@ class ForkSlave(Slave):
     def close(self) -> None:
         """See `Slave`. Ends all processes."""
         if self._active is not None:
-            with suppress(OSError):  # it died of that
-                self._active.channel.send(Message.CLOSE)
-                self._active.channel.wait(_CLOSE_TIME)
+            with suppress(OSError, SlaveError):  # it died of that, or never was there
+                self._active.send(Message.CLOSE)
+                if self._active.wait(_CLOSE_TIME):
+                    self._active.meet()
+                    self._active.wait(_CLOSE_TIME)
         self._end()
 
     def _end(self) -> None:
@@ -312,29 +382,50 @@ class ForkSlave(Slave):
         """See `Slave`.
 
         Raises:
-            SlaveError: the process cannot be forked, with the reason.
+            SlaveError: the process cannot be forked, with the reason. If it could before, that
+                comes with the next call.
         """
         if self._pending:
             self._run()
-        state = self._fork(self._holder())
+        holder = self._holder()
+        situation, needs_copy = self._habits.situation, self._needs_copy()
+        self._habits.note(Event.SAVE, len(self._saved))
+        copy = self._copy_of_active(holder) if needs_copy else None
+        if self._origin is None or self._trail is None:
+            assert copy is not None
+            self._origin, self._trail, copy = copy, START, None
+        state = _State(situation, self._origin, self._trail, copy)
         self._saved.add(state)
+        self._latest = state
         return state
 
     def set_state(self, state: object) -> None:
         """See `Slave`."""
-        self._go_on_with(self._fork(self._state(state)))
+        saved = self._state(state)
+        self._habits.note(Event.RESTORE, len(self._saved))
+        self._note_use(saved, Event.RESTORE)
+        copy = self._take_copy(saved)
+        self._latest = saved
+        self._go_on_with(copy, saved)
 
     def set_state_and_free(self, state: object) -> None:
-        """See `Slave`. Needs no fork."""
-        holder = self._state(state)
-        self._saved.discard(holder)
-        self._go_on_with(holder)
+        """See `Slave`. Needs no fork where no other state has this one for its origin."""
+        saved = self._state(state)
+        self._habits.note(Event.GIVE_UP, len(self._saved))
+        is_last = not any(s.origin is saved.origin for s in self._saved - {saved})
+        self._note_use(saved, Event.GIVE_UP)
+        if is_last and not saved.trail.tasks:
+            self._saved.discard(saved)
+            self._go_on_with(saved.origin, None)
+            if saved.copy is not None:
+                self._end_process(saved.copy)
+        else:
+            self._go_on_with(self._take_copy(saved), saved)
+            self._free(saved)
 
     def free_state(self, state: object) -> None:
         """See `Slave`."""
-        holder = self._state(state)
-        self._saved.discard(holder)
-        holder.channel.close()
+        self._free(self._state(state))
 
     def serialize_state(self, state: object) -> bytes:  # noqa: ARG002
         """See `Slave`: a process cannot be put into bytes."""
@@ -344,48 +435,117 @@ class ForkSlave(Slave):
         """See `serialize_state`."""
         raise SlaveError(f"a saved state of {self.description.model} is a process, not bytes")
 
-    def _state(self, state: object) -> _Holder:
-        if not isinstance(state, _Holder) or state not in self._saved:
+    def _state(self, state: object) -> _State:
+        if not isinstance(state, _State) or state not in self._saved:
             raise SlaveError("no such state is saved")
         return state
 
-    def _fork(self, holder: _Holder) -> _Holder:
-        """A copy of a holder, as it stands.
+    # ---- Copies -------------------------------------------------------------------------------
+
+    def _needs_copy(self) -> bool:
+        """Whether a state that is saved here needs a process of its own."""
+        return self._trail is None or self._habits.use(self._habits.situation) is not None
+
+    def _copy_of_active(self, holder: HeldProcess) -> HeldProcess:
+        """The one that was made ahead, or a new one; waited for only if there was none before."""
+        copy, self._ahead = self._ahead, None
+        try:
+            copy = copy or holder.copy()
+        except OSError:
+            self._drop_active()
+            raise holder.death() from None
+        if self._has_forked:
+            self._unconfirmed.append(copy)
+        else:
+            _meet(copy)
+            self._has_forked = True
+        return copy
+
+    def _prepare_latest(self) -> None:
+        """A copy of the state that was saved or restored last is likely to be needed."""
+        state = self._latest
+        if state in self._saved and state is not None and state.copy is None:
+            with suppress(OSError):  # it is dead: whoever restores the state will see
+                state.copy = _copy_from_origin(state)
+
+    def _take_copy(self, state: _State) -> HeldProcess:
+        """A process that stands at the state, or is on its way there if it was made ahead.
 
         Raises:
-            SlaveCrashedError: it is dead.
-            SlaveError: it cannot be forked.
+            SlaveError: there is none, as `HeldProcess.meet` says.
         """
-        ours, theirs = socket.socketpair()
-        with theirs:
-            try:
-                holder.channel.send(Message.FORK)
-                holder.channel.send_socket(theirs)
-                kind, answer = holder.channel.receive()
-            except (EOFError, OSError):
-                ours.close()
-                if holder is self._active:
-                    self._drop_active()
-                raise self._died(holder) from None
-        if kind is not Message.DONE:
-            ours.close()
-            raise _refusal(answer)
-        return _Holder(self._family.channel(ours), *PROCESS.unpack(answer))
+        copy, state.copy = state.copy, None
+        if copy is not None:  # whether it is there will be seen when it is asked
+            return copy
+        try:
+            copy = _copy_from_origin(state)
+        except OSError:
+            raise state.origin.death() from None
+        _meet(copy)
+        return copy
 
-    def _go_on_with(self, holder: _Holder) -> None:
+    def _note_use(self, state: _State, use: Event | None) -> None:
+        """The first use counts."""
+        if not state.is_used:
+            state.is_used = True
+            self._habits.note_use(state.situation, use)
+
+    def _is_latest_for_restores(self) -> bool:
+        """Whether the state saved last, and not yet used, is likely to be restored and kept."""
+        state = self._latest
+        return (
+            state is not None
+            and not state.is_used
+            and self._habits.use(state.situation) is Event.RESTORE
+        )
+
+    def _go_on_with(self, holder: HeldProcess, state: _State | None) -> None:
+        """``state``: at which it stands, if there is still such a state."""
         self._drop_active()
+        if holder in self._unconfirmed:
+            self._unconfirmed.remove(holder)
         self._active = holder
+        self._origin = state.origin if state is not None else None
+        self._trail = state.trail if state is not None else None
         self._pending = []
         self._outputs = self._discrete_outputs = None
 
+    def _free(self, state: _State) -> None:
+        self._saved.discard(state)
+        self._note_use(state, None)
+        if state.copy is not None:
+            self._end_process(state.copy)
+        if not any(other.origin is state.origin for other in self._saved):
+            self._end_process(state.origin)
+            if self._origin is state.origin:
+                self._origin = self._trail = None
+
+    def _end_process(self, holder: HeldProcess) -> None:
+        if holder in self._unconfirmed:
+            self._unconfirmed.remove(holder)
+        holder.close()
+
     def _free_all(self) -> None:
-        for holder in self._saved:
-            holder.channel.close()
-        self._saved.clear()
+        for state in tuple(self._saved):
+            self._free(state)
 
 
-def _refusal(answer: bytes) -> DoublestepError:
-    """The error in an answer that is not `Message.DONE`."""
-    error = decode_reply([], answer).error
-    assert error is not None
-    return error
+def _copy_from_origin(state: _State) -> HeldProcess:
+    """A process on its way to the state.
+
+    Raises:
+        OSError: its origin is gone.
+    """
+    copy = state.origin.copy()
+    with suppress(OSError):  # `meet` will say so
+        copy.follow(state.trail)
+    return copy
+
+
+def _meet(copy: HeldProcess) -> None:
+    """`HeldProcess.meet`, for one that nobody else knows."""
+    try:
+        copy.meet()
+    except BaseException:
+        copy.close()
+        raise

@@ -1,0 +1,132 @@
+"""`HeldProcess`: a process that holds a model, and how to get another one like it."""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+
+from protocol.codec import decode_reply
+from protocol.errors import DoublestepError, SlaveCrashedError, SlaveError
+from slave_node.states.channel import DURATION, PROCESS, Message
+from slave_node.states.fork_family import HolderFamily
+from slave_node.states.fork_trail import Task, Trail
+
+
+class HeldProcess:
+    """One holder of a family, see ``fork_holder.py``: the slave itself, or a saved state.
+
+    Args:
+        family: to which it belongs.
+        connection: our end of the socket that it serves.
+        process: its process id; 0: it is still to say that it is there, see `meet`.
+        original: of which it is a copy.
+    """
+
+    def __init__(
+        self,
+        family: HolderFamily,
+        connection: socket.socket,
+        process: int = 0,
+        original: HeldProcess | None = None,
+    ) -> None:
+        self._family = family
+        self._channel = family.channel(connection)
+        self._process = process
+        self._original = original
+        self._owed: deque[Task] = deque()
+
+    def send(self, kind: Message, payload: bytes = b"") -> None:
+        """Ask it.
+
+        Raises:
+            OSError: it is gone.
+        """
+        self._channel.send(kind, payload)
+
+    def receive(self) -> tuple[Message, bytes]:
+        """What it answers.
+
+        Raises:
+            EOFError, OSError: it is gone.
+            SlaveError: it never was there, see `meet`.
+        """
+        self.meet()
+        return self._channel.receive()
+
+    def wait(self, timeout: float) -> bool:
+        """Whether it answers, or is gone, within ``timeout`` seconds."""
+        return self._channel.wait(timeout)
+
+    def copy(self) -> HeldProcess:
+        """A copy of it, as it will stand after all that it was asked before; not waited for.
+
+        Raises:
+            OSError: it is gone.
+        """
+        ours, theirs = socket.socketpair()
+        with theirs:
+            try:
+                self._channel.send(Message.FORK)
+                self._channel.send_socket(theirs)
+            except OSError:
+                ours.close()
+                raise
+        return HeldProcess(self._family, ours, original=self)
+
+    def follow(self, trail: Trail) -> None:
+        """Let it do all that again; not waited for.
+
+        Raises:
+            OSError: it is gone.
+        """
+        for task in trail.tasks:
+            self._channel.send(task.kind, task.payload)
+        self._owed.extend(trail.tasks)
+
+    def meet(self) -> None:
+        """Wait until it is there, and has done all again that it was to follow.
+
+        Raises:
+            SlaveCrashedError: it, or its original, died before.
+            SlaveError: it could not be forked; or it did not end where it ended the first time.
+        """
+        try:
+            if not self._process:
+                kind, answer = self._channel.receive()
+                if kind is not Message.DONE:
+                    raise refusal(answer)
+                (self._process,) = PROCESS.unpack(answer)
+            while self._owed:
+                task = self._owed.popleft()
+                kind, answer = self._channel.receive()
+                if kind is not Message.DONE or answer[DURATION.size :] != task.answer:
+                    raise _did_not_repeat(task)
+        except (EOFError, OSError):
+            raise self.death() from None
+        self._original = None
+
+    def death(self) -> SlaveCrashedError:
+        """The error that it is gone, and how it died; or its original, if it was never there."""
+        dead = self if self._process or self._original is None else self._original
+        return SlaveCrashedError(
+            f"the process that held the model {self._family.death(dead._process)}"
+        )
+
+    def close(self) -> None:
+        """Let it end. Idempotent."""
+        self._channel.close()
+
+
+def refusal(answer: bytes) -> DoublestepError:
+    """The error in an answer that is not `Message.DONE`."""
+    error = decode_reply([], answer).error
+    assert error is not None
+    return error
+
+
+def _did_not_repeat(task: Task) -> SlaveError:
+    what = "a step" if task.kind is Message.STEP else "what it did"
+    return SlaveError(
+        f"the model does not repeat: {what}, done again from the same state, ended otherwise",
+        remedy='let its state not be saved: state = "none"',
+    )
