@@ -148,6 +148,29 @@ def _pack(value: Any) -> bytes:
     return msgpack.packb(value, use_bin_type=True)  # type: ignore[no-any-return]
 
 
+_Part = bytes | memoryview
+
+
+def _packed_with_block(
+    before: tuple[Any, ...], parts: Sequence[_Part], after: tuple[Any, ...] = ()
+) -> bytes:
+    """An array of values with one byte string among them, which is made of ``parts``.
+
+    The same bytes as those of `_pack`, which would copy a large byte string several times.
+    """
+    size = sum(map(len, parts))
+    if size <= _SMALL_MESSAGE:
+        return _pack((*before, b"".join(parts), *after))
+    head = bytes((_ARRAY | (len(before) + 1 + len(after)),)) + _pack(before)[1:]
+    long = _BIN_32.pack(0xC6, size) if size >= 2**16 else _BIN_16.pack(0xC5, size)
+    return b"".join((head, long, *parts, _pack(after)[1:]))
+
+
+_ARRAY: Final = 0x90  # of up to 15 items, in MessagePack
+_BIN_16: Final = Struct(">BH")
+_BIN_32: Final = Struct(">BI")
+
+
 # --- values -------------------------------------------------------------------------------------
 
 
@@ -405,27 +428,56 @@ def _do_step_maker(no_set_state_prior: bool) -> _Maker:
 
 def encode_program(calls: Sequence[Call]) -> bytes:
     """A list of calls as the ``program`` of a request."""
-    shape: list[Any] = []
-    numbers: list[bytes] = []
+    shape: list[_Shape] = []
+    numbers: list[_Part] = []
+    is_repeated = True
     for call in calls:
         kind = type(call)
         if kind is SetInputs:
-            shape.append((SetInputs.verb, *call.derivatives.shape))  # type: ignore[union-attr]
-            numbers.append(_float_bytes(call.derivatives))  # type: ignore[union-attr]
+            shape.append(call.derivatives.shape)  # type: ignore[union-attr]
+            numbers.append(_float_buffer(call.derivatives))  # type: ignore[union-attr]
         elif kind is DoStep:
-            shape.append((DoStep.verb, call.no_set_state_prior))  # type: ignore[union-attr]
+            shape.append(call.no_set_state_prior)  # type: ignore[union-attr]
             numbers.append(_TWO.pack(call.communication_point, call.step_size))  # type: ignore[union-attr]
         else:
-            shape.append(_fields(call))
-    return _pack((_pack(shape), b"".join(numbers)))
+            shape.append(call)
+            is_repeated = is_repeated and kind in _REPEATED
+    packed = _cached_program_shape(tuple(shape)) if is_repeated else _program_shape(shape)
+    return _packed_with_block((packed,), numbers)
+
+
+_Shape = Call | tuple[int, ...] | bool
+"""A call without its numbers: those of inputs and steps are left out."""
+
+_REPEATED: Final = frozenset({GetOutputs, GetDiscreteOutputs, GetState, SetState, FreeState})
+"""Calls that come again in every step, apart from inputs and steps."""
+
+
+def _program_shape(items: Sequence[_Shape]) -> bytes:
+    shape: list[Any] = []
+    for item in items:
+        if type(item) is tuple:
+            shape.append((SetInputs.verb, *item))
+        elif type(item) is bool:
+            shape.append((DoStep.verb, item))
+        else:
+            shape.append(_fields(item))  # type: ignore[arg-type]
+    return _pack(shape)
+
+
+_cached_program_shape = lru_cache(_CACHED_SHAPES)(_program_shape)
 
 
 def _fields(call: Call) -> list[Any]:
     return [call.verb, *(getattr(call, name) for name in _FIELDS.get(type(call), ()))]
 
 
-def _float_bytes(array: FloatArray) -> bytes:
-    return array.astype(_LITTLE_ENDIAN, copy=False).tobytes()
+def _float_buffer(array: FloatArray) -> _Part:
+    """The bytes of an array, without a copy where it is large."""
+    array = np.ascontiguousarray(array, _LITTLE_ENDIAN)
+    if array.nbytes <= _SMALL_MESSAGE:
+        return array.tobytes()
+    return array.reshape(-1).view(np.uint8).data
 
 
 def decode_program(data: bytes) -> list[Call]:
@@ -449,7 +501,7 @@ def _shape_and_numbers(value: Any, what: str) -> tuple[bytes, bytes]:
 
 def encode_request(epoch: int, sequence: int, program: bytes) -> bytes:
     """A request: whose it is, which one it is, and what to do."""
-    return _pack([PROTOCOL_VERSION, epoch, sequence, program])
+    return _packed_with_block((PROTOCOL_VERSION, epoch, sequence), (program,))
 
 
 def decode_request(data: bytes) -> tuple[int, int, bytes]:
@@ -509,26 +561,27 @@ def encode_reply(reply: Reply) -> bytes:
     """A reply as bytes."""
     error = None if reply.error is None else reply.error.to_reply()
     shape: list[Any] = []
-    numbers: list[bytes] = []
+    numbers: list[_Part] = []
     for result in reply.results:
         if result is None:
             shape.append(None)
         elif type(result) is np.ndarray:
             shape.append(result.shape)
-            numbers.append(_float_bytes(result))
+            numbers.append(_float_buffer(result))
         elif type(result) is StepResult:
             shape.append(result.status.value)
             numbers.append(_ONE.pack(result.time))
         else:
             shape.append(_plain(result))
-    packed = (PROTOCOL_VERSION, _pack(shape), b"".join(numbers), error, reply.compute_time)
-    return _pack(packed)
+    return _packed_with_block(
+        (PROTOCOL_VERSION, _pack(shape)), numbers, (error, reply.compute_time)
+    )
 
 
 def _plain(result: object) -> Any:
     """A result by hand: with its numbers in it."""
     if isinstance(result, np.ndarray):
-        return [len(result), _float_bytes(result)]
+        return [len(result), result.astype(_LITTLE_ENDIAN, copy=False).tobytes()]
     if isinstance(result, StepResult):
         return [result.status.value, result.time]
     if isinstance(result, SlaveDescription | Examination):
