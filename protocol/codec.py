@@ -107,16 +107,18 @@ def _unpack(data: bytes, what: str) -> Any:
     if size > MAX_MESSAGE_BYTES:
         raise MalformedMessageError(f"{what} of {size} bytes; the limit is {MAX_MESSAGE_BYTES}")
     try:
-        hooks = {} if size <= _SMALL_MESSAGE else _prepared(data, what)
-        return msgpack.unpackb(data, raw=False, strict_map_key=True, max_ext_len=0, **hooks)
+        hook = None if size <= _SMALL_MESSAGE else _counter(data, what)
+        return msgpack.unpackb(
+            data, raw=False, strict_map_key=True, max_ext_len=0, object_hook=hook, list_hook=hook
+        )
     except (ValueError, msgpack.UnpackException) as error:
         raise MalformedMessageError(
             f"{what} is not valid MessagePack: {str(error) or type(error).__name__}"
         ) from error
 
 
-def _prepared(data: bytes, what: str) -> dict[str, Callable[[Any], Any]]:
-    """Bound the memory that a large message can ask for.
+def _counter(data: bytes, what: str) -> Callable[[Any], Any]:
+    """Bound the memory that a large message can ask for; returns what is to see each container.
 
     Five bytes can announce a million items, and room would be made for them, so go through the
     message once without building anything. Then a byte can still ask for a container: count them
@@ -134,7 +136,7 @@ def _prepared(data: bytes, what: str) -> dict[str, Callable[[Any], Any]]:
             raise MalformedMessageError(f"{what} holds more than {_MAX_CONTAINERS} containers")
         return value
 
-    return {"object_hook": count, "list_hook": count}
+    return count
 
 
 def _shown(value: Any) -> str:
@@ -492,11 +494,11 @@ def decode_program(data: bytes) -> list[Call]:
 
 
 def _shape_and_numbers(value: Any, what: str) -> tuple[bytes, bytes]:
-    match value:
-        case [bytes() as shape, bytes() as numbers]:
+    if type(value) is list and len(value) == 2:
+        shape, numbers = value
+        if type(shape) is bytes and type(numbers) is bytes:
             return shape, numbers
-        case _:
-            raise MalformedMessageError(f"{what} must be [shape, numbers], both bytes")
+    raise MalformedMessageError(f"{what} must be [shape, numbers], both bytes")
 
 
 def encode_request(epoch: int, sequence: int, program: bytes) -> bytes:
