@@ -107,16 +107,18 @@ def _unpack(data: bytes, what: str) -> Any:
     if size > MAX_MESSAGE_BYTES:
         raise MalformedMessageError(f"{what} of {size} bytes; the limit is {MAX_MESSAGE_BYTES}")
     try:
-        hooks = {} if size <= _SMALL_MESSAGE else _prepared(data, what)
-        return msgpack.unpackb(data, raw=False, strict_map_key=True, max_ext_len=0, **hooks)
+        hook = None if size <= _SMALL_MESSAGE else _counter(data, what)
+        return msgpack.unpackb(
+            data, raw=False, strict_map_key=True, max_ext_len=0, object_hook=hook, list_hook=hook
+        )
     except (ValueError, msgpack.UnpackException) as error:
         raise MalformedMessageError(
             f"{what} is not valid MessagePack: {str(error) or type(error).__name__}"
         ) from error
 
 
-def _prepared(data: bytes, what: str) -> dict[str, Callable[[Any], Any]]:
-    """Bound the memory that a large message can ask for.
+def _counter(data: bytes, what: str) -> Callable[[Any], Any]:
+    """Bound the memory that a large message can ask for; returns what is to see each container.
 
     Five bytes can announce a million items, and room would be made for them, so go through the
     message once without building anything. Then a byte can still ask for a container: count them
@@ -134,7 +136,7 @@ def _prepared(data: bytes, what: str) -> dict[str, Callable[[Any], Any]]:
             raise MalformedMessageError(f"{what} holds more than {_MAX_CONTAINERS} containers")
         return value
 
-    return {"object_hook": count, "list_hook": count}
+    return count
 
 
 def _shown(value: Any) -> str:
@@ -146,6 +148,29 @@ def _shown(value: Any) -> str:
 
 def _pack(value: Any) -> bytes:
     return msgpack.packb(value, use_bin_type=True)  # type: ignore[no-any-return]
+
+
+_Part = bytes | memoryview
+
+
+def _packed_with_block(
+    before: tuple[Any, ...], parts: Sequence[_Part], after: tuple[Any, ...] = ()
+) -> bytes:
+    """An array of values with one byte string among them, which is made of ``parts``.
+
+    The same bytes as those of `_pack`, which would copy a large byte string several times.
+    """
+    size = sum(map(len, parts))
+    if size <= _SMALL_MESSAGE:
+        return _pack((*before, b"".join(parts), *after))
+    head = bytes((_ARRAY | (len(before) + 1 + len(after)),)) + _pack(before)[1:]
+    long = _BIN_32.pack(0xC6, size) if size >= 2**16 else _BIN_16.pack(0xC5, size)
+    return b"".join((head, long, *parts, _pack(after)[1:]))
+
+
+_ARRAY: Final = 0x90  # of up to 15 items, in MessagePack
+_BIN_16: Final = Struct(">BH")
+_BIN_32: Final = Struct(">BI")
 
 
 # --- values -------------------------------------------------------------------------------------
@@ -405,27 +430,56 @@ def _do_step_maker(no_set_state_prior: bool) -> _Maker:
 
 def encode_program(calls: Sequence[Call]) -> bytes:
     """A list of calls as the ``program`` of a request."""
-    shape: list[Any] = []
-    numbers: list[bytes] = []
+    shape: list[_Shape] = []
+    numbers: list[_Part] = []
+    is_repeated = True
     for call in calls:
         kind = type(call)
         if kind is SetInputs:
-            shape.append((SetInputs.verb, *call.derivatives.shape))  # type: ignore[union-attr]
-            numbers.append(_float_bytes(call.derivatives))  # type: ignore[union-attr]
+            shape.append(call.derivatives.shape)  # type: ignore[union-attr]
+            numbers.append(_float_buffer(call.derivatives))  # type: ignore[union-attr]
         elif kind is DoStep:
-            shape.append((DoStep.verb, call.no_set_state_prior))  # type: ignore[union-attr]
+            shape.append(call.no_set_state_prior)  # type: ignore[union-attr]
             numbers.append(_TWO.pack(call.communication_point, call.step_size))  # type: ignore[union-attr]
         else:
-            shape.append(_fields(call))
-    return _pack((_pack(shape), b"".join(numbers)))
+            shape.append(call)
+            is_repeated = is_repeated and kind in _REPEATED
+    packed = _cached_program_shape(tuple(shape)) if is_repeated else _program_shape(shape)
+    return _packed_with_block((packed,), numbers)
+
+
+_Shape = Call | tuple[int, ...] | bool
+"""A call without its numbers: those of inputs and steps are left out."""
+
+_REPEATED: Final = frozenset({GetOutputs, GetDiscreteOutputs, GetState, SetState, FreeState})
+"""Calls that come again in every step, apart from inputs and steps."""
+
+
+def _program_shape(items: Sequence[_Shape]) -> bytes:
+    shape: list[Any] = []
+    for item in items:
+        if type(item) is tuple:
+            shape.append((SetInputs.verb, *item))
+        elif type(item) is bool:
+            shape.append((DoStep.verb, item))
+        else:
+            shape.append(_fields(item))  # type: ignore[arg-type]
+    return _pack(shape)
+
+
+_cached_program_shape = lru_cache(_CACHED_SHAPES)(_program_shape)
 
 
 def _fields(call: Call) -> list[Any]:
     return [call.verb, *(getattr(call, name) for name in _FIELDS.get(type(call), ()))]
 
 
-def _float_bytes(array: FloatArray) -> bytes:
-    return array.astype(_LITTLE_ENDIAN, copy=False).tobytes()
+def _float_buffer(array: FloatArray) -> _Part:
+    """The bytes of an array, without a copy where it is large."""
+    array = np.ascontiguousarray(array, _LITTLE_ENDIAN)
+    if array.nbytes <= _SMALL_MESSAGE:
+        return array.tobytes()
+    return array.reshape(-1).view(np.uint8).data
 
 
 def decode_program(data: bytes) -> list[Call]:
@@ -440,16 +494,16 @@ def decode_program(data: bytes) -> list[Call]:
 
 
 def _shape_and_numbers(value: Any, what: str) -> tuple[bytes, bytes]:
-    match value:
-        case [bytes() as shape, bytes() as numbers]:
+    if type(value) is list and len(value) == 2:
+        shape, numbers = value
+        if type(shape) is bytes and type(numbers) is bytes:
             return shape, numbers
-        case _:
-            raise MalformedMessageError(f"{what} must be [shape, numbers], both bytes")
+    raise MalformedMessageError(f"{what} must be [shape, numbers], both bytes")
 
 
 def encode_request(epoch: int, sequence: int, program: bytes) -> bytes:
     """A request: whose it is, which one it is, and what to do."""
-    return _pack([PROTOCOL_VERSION, epoch, sequence, program])
+    return _packed_with_block((PROTOCOL_VERSION, epoch, sequence), (program,))
 
 
 def decode_request(data: bytes) -> tuple[int, int, bytes]:
@@ -509,26 +563,27 @@ def encode_reply(reply: Reply) -> bytes:
     """A reply as bytes."""
     error = None if reply.error is None else reply.error.to_reply()
     shape: list[Any] = []
-    numbers: list[bytes] = []
+    numbers: list[_Part] = []
     for result in reply.results:
         if result is None:
             shape.append(None)
         elif type(result) is np.ndarray:
             shape.append(result.shape)
-            numbers.append(_float_bytes(result))
+            numbers.append(_float_buffer(result))
         elif type(result) is StepResult:
             shape.append(result.status.value)
             numbers.append(_ONE.pack(result.time))
         else:
             shape.append(_plain(result))
-    packed = (PROTOCOL_VERSION, _pack(shape), b"".join(numbers), error, reply.compute_time)
-    return _pack(packed)
+    return _packed_with_block(
+        (PROTOCOL_VERSION, _pack(shape)), numbers, (error, reply.compute_time)
+    )
 
 
 def _plain(result: object) -> Any:
     """A result by hand: with its numbers in it."""
     if isinstance(result, np.ndarray):
-        return [len(result), _float_bytes(result)]
+        return [len(result), result.astype(_LITTLE_ENDIAN, copy=False).tobytes()]
     if isinstance(result, StepResult):
         return [result.status.value, result.time]
     if isinstance(result, SlaveDescription | Examination):

@@ -12,13 +12,13 @@ import multiprocessing
 import os
 import shutil
 import signal
+import socket
 import sys
 import tempfile
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Protocol
 
@@ -33,6 +33,7 @@ from protocol.errors import (
 )
 from protocol.logs import LogFormat, configure_logs
 from protocol.slave import CallExecutor, SlaveDescription, StartValue
+from slave_node.pipe import Pipe
 
 _END = b""
 _CLOSE_TIME = 0.5
@@ -115,7 +116,7 @@ class WorkerProcess:
         self._reference = reference
         self._load_time = load_time
         self._process: multiprocessing.process.BaseProcess | None = None
-        self._pipe: Connection | None = None
+        self._pipe: Pipe | None = None
         self._scratch: str | None = None
         self._using = threading.Lock()
         """Held while the pipe is in use; ``kill`` needs none and makes the holder let go."""
@@ -134,18 +135,19 @@ class WorkerProcess:
         self._discard()
         self._scratch = tempfile.mkdtemp(prefix="doublestep-")
         context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
+        ours, theirs = socket.socketpair()
+        self._pipe = Pipe(ours)
         self._process = context.Process(
             target=_main, args=(theirs, self._reference, self._scratch), daemon=True
         )
         self._process.start()
         theirs.close()
         try:
-            if not self._pipe.poll(self._load_time):
+            if not self._pipe.has_message(self._load_time):
                 raise DeadlineError(
                     f"the model was not loaded within {self._load_time:g} s", phase="load"
                 )
-            data = self._pipe.recv_bytes()
+            data = self._pipe.receive()
         except (EOFError, OSError):
             raise self._crashed() from None
         except DeadlineError:
@@ -169,8 +171,8 @@ class WorkerProcess:
                     "the process that held the model is gone", remedy="claim the slave again"
                 )
             try:
-                self._pipe.send_bytes(program)
-                return self._pipe.recv_bytes()
+                self._pipe.send(program)
+                return self._pipe.receive()
             except (EOFError, OSError):
                 raise self._crashed() from None
 
@@ -188,7 +190,7 @@ class WorkerProcess:
         try:
             if self._pipe is not None and self._process is not None:
                 with suppress(OSError):
-                    self._pipe.send_bytes(_END)
+                    self._pipe.send(_END)
                     self._process.join(_CLOSE_TIME)
             self._discard()
         finally:
@@ -221,9 +223,10 @@ class WorkerProcess:
             self._scratch = None
 
 
-def _main(pipe: Connection, reference: ModelReference, scratch: str) -> None:
+def _main(end: socket.socket, reference: ModelReference, scratch: str) -> None:
     """Load the model, then execute programs until the node says end or is gone."""
     _die_with_parent()
+    pipe = Pipe(end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     configure_logs(
@@ -241,12 +244,12 @@ def _main(pipe: Connection, reference: ModelReference, scratch: str) -> None:
             state_kind=reference.state_kind,
         )
     except DoublestepError as error:
-        pipe.send_bytes(encode_error(error))
+        pipe.send(encode_error(error))
         return
     try:
-        pipe.send_bytes(execute_program(executor, reference, encode_program([Describe()])))
-        while program := pipe.recv_bytes():
-            pipe.send_bytes(execute_program(executor, reference, program))
+        pipe.send(execute_program(executor, reference, encode_program([Describe()])))
+        while program := pipe.receive():
+            pipe.send(execute_program(executor, reference, program))
     except (EOFError, ConnectionError):
         logging.getLogger(__name__).warning("the node is gone: ending")
     finally:

@@ -833,23 +833,32 @@ def test_structural_parameter_sizes_the_vector(instance: Open) -> None:
 
 @pytest.mark.parametrize(("name", "count"), [("few_variables", 10), ("many_variables", 5000)])
 def test_many_variables_are_all_there(instance: Open, name: str, count: int) -> None:
-    """Every one of the lags follows its own input, and all of them are restored."""
+    """Every one of the lags follows its own input, and all of them are restored.
+
+    So they do when the value references come in any order, one by one or some side by side.
+    """
     made = instance(Slave2, name)
     made.initialize()
     inputs_, outputs = made.content.names("input"), made.content.names("output")
     assert len(inputs_) == len(outputs) == count
     u = np.arange(1.0, count + 1.0)
     to, from_ = made.content.references(inputs_), made.content.references(outputs)
-    made.fmu.setReal(to, list(u))
-    made.fmu.setRealInputDerivatives(to, [1] * count, list(-u))
-    saved = made.save()
-    for _ in range(2):
-        made.step(0.3)
-        exact = u * (1.0 - 0.3 + 1.0) - u * 2.0 * math.exp(-0.3)  # y' = u (1 - t) - y
-        np.testing.assert_allclose(made.fmu.getReal(from_), exact, rtol=1e-12)
-        slopes = made.fmu.getRealOutputDerivatives(from_, [1] * count)
-        np.testing.assert_allclose(slopes, 0.7 * u - exact, rtol=1e-11)
-        made.restore(saved, 0.0)
+    start = made.save()
+    third = count // 3
+    shuffled = np.r_[count - 1 : 2 * third - 1 : -1, third : 2 * third, 0:third]
+    for order in (np.arange(count), shuffled):
+        made.fmu.setReal([to[i] for i in order], list(u[order]))
+        made.fmu.setRealInputDerivatives([to[i] for i in order], [1] * count, list(-u[order]))
+        saved = made.save()
+        for _ in range(2):
+            made.step(0.3)
+            exact = u * (1.0 - 0.3 + 1.0) - u * 2.0 * math.exp(-0.3)  # y' = u (1 - t) - y
+            asked = [from_[i] for i in order]
+            np.testing.assert_allclose(made.fmu.getReal(asked), exact[order], rtol=1e-12)
+            slopes = made.fmu.getRealOutputDerivatives(asked, [1] * count)
+            np.testing.assert_allclose(slopes, (0.7 * u - exact)[order], rtol=1e-11)
+            made.restore(saved, 0.0)
+        made.restore(start, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,11 @@ typedef struct {
 
     /* All that follows may be NULL. */
 
+    /* Returns how many scalar variables, from this one on, have value references that follow each
+     * other, the same access and places side by side; so have their derivatives of each order.
+     * NULL: each stands by itself. */
+    size_t (*side_by_side)(Type type, uint32_t reference);
+
     /* Returns NULL, or why there is no instance. `resources`: folder or URI of the resources. */
     const char *(*open)(void *hidden, const char *resources);
     void (*close)(void *hidden);

@@ -245,38 +245,52 @@ static Status check_count(const Instance *instance, const char *function, size_t
                   expected);
 }
 
+/* How many of the first of these `n` value references, at least one, go to or come from places
+ * side by side. */
+static size_t run_length(Type type, const uint32_t reference[], size_t n)
+{
+    size_t most = behaviour.side_by_side ? behaviour.side_by_side(type, reference[0]) : 1;
+    most = most < n ? most : n;
+    size_t length = 1;
+    while (length < most && reference[length] == reference[0] + length)
+        ++length;
+    return length;
+}
+
 Status read_values(Instance *instance, const char *function, Type type, const uint32_t reference[],
                    size_t n_references, void *values, size_t n)
 {
     if (check_arguments(instance, function, reference, n_references, values) != OK)
         return ERROR;
     calculate(instance);
-    size_t expected = 0;
-    for (size_t i = 0; i < n_references; ++i) {
+    size_t expected = 0, run;
+    for (size_t i = 0; i < n_references; i += run) {
         const Variable variable = readable(instance, function, type, reference[i]);
         if (!variable.place)
             return ERROR;
-        expected += variable.count;
+        run = run_length(type, &reference[i], n_references - i);
+        expected += run * variable.count;
     }
     if (check_count(instance, function, n, expected) != OK)
         return ERROR;
     unsigned char *to = values;
-    for (size_t i = 0; i < n_references; ++i) {
+    for (size_t i = 0; i < n_references; i += run) {
         const Variable variable = find(instance, function, type, reference[i]);
-        memcpy(to, variable.place, variable.count * SIZES[type]);
-        to += variable.count * SIZES[type];
+        run = run_length(type, &reference[i], n_references - i);
+        memcpy(to, variable.place, run * variable.count * SIZES[type]);
+        to += run * variable.count * SIZES[type];
     }
     return OK;
 }
 
-/* An input that is set becomes a constant. */
-static void clear_derivatives(Instance *instance, uint32_t reference)
+/* Inputs that are set become constants: of a run of them the derivatives are zeroed. */
+static void clear_derivatives(Instance *instance, uint32_t reference, size_t run)
 {
     for (int order = 1; order <= MAX_INPUT_DERIVATIVE_ORDER && behaviour.input_derivative;
          ++order) {
         double *derivative = behaviour.input_derivative(instance->state, reference, order);
         if (derivative)
-            *derivative = 0.0;
+            memset(derivative, 0, run * sizeof *derivative);
     }
 }
 
@@ -285,22 +299,24 @@ Status write_values(Instance *instance, const char *function, Type type,
 {
     if (check_arguments(instance, function, reference, n_references, values) != OK)
         return ERROR;
-    size_t expected = 0;
-    for (size_t i = 0; i < n_references; ++i) {
+    size_t expected = 0, run;
+    for (size_t i = 0; i < n_references; i += run) {
         const Variable variable = writable(instance, function, type, reference[i]);
         if (!variable.place)
             return ERROR;
-        expected += variable.count;
+        run = run_length(type, &reference[i], n_references - i);
+        expected += run * variable.count;
     }
     if (check_count(instance, function, n, expected) != OK)
         return ERROR;
     const unsigned char *from = values;
-    for (size_t i = 0; i < n_references; ++i) {
+    for (size_t i = 0; i < n_references; i += run) {
         const Variable variable = find(instance, function, type, reference[i]);
-        memcpy(variable.place, from, variable.count * SIZES[type]);
-        from += variable.count * SIZES[type];
+        run = run_length(type, &reference[i], n_references - i);
+        memcpy(variable.place, from, run * variable.count * SIZES[type]);
+        from += run * variable.count * SIZES[type];
         if (type == FLOAT64)
-            clear_derivatives(instance, reference[i]);
+            clear_derivatives(instance, reference[i], run);
     }
     return OK;
 }
@@ -345,6 +361,16 @@ Status write_texts(Instance *instance, const char *function, const uint32_t refe
 
 /* ---- Derivatives --------------------------------------------------------------------------- */
 
+/* The same as `run_length` for derivatives of these orders. */
+static size_t run_of_one_order(const uint32_t reference[], const int order[], size_t n)
+{
+    const size_t most = run_length(FLOAT64, reference, n);
+    size_t length = 1;
+    while (length < most && order[length] == order[0])
+        ++length;
+    return length;
+}
+
 Status set_input_derivatives(Instance *instance, const char *function, const uint32_t reference[],
                              size_t n, const int order[], const double value[])
 {
@@ -352,7 +378,8 @@ Status set_input_derivatives(Instance *instance, const char *function, const uin
         return ERROR;
     if (MAX_INPUT_DERIVATIVE_ORDER == 0 || !behaviour.input_derivative)
         return report(instance, ERROR, function, "derivatives of inputs are not supported");
-    for (size_t i = 0; i < n; ++i) {
+    size_t run;
+    for (size_t i = 0; i < n; i += run) {
         if (!order || order[i] < 1 || order[i] > MAX_INPUT_DERIVATIVE_ORDER)
             return report(instance, ERROR, function,
                           "order %d of value reference %u; orders 1 to %d are supported",
@@ -361,9 +388,13 @@ Status set_input_derivatives(Instance *instance, const char *function, const uin
         if (!behaviour.input_derivative(instance->state, reference[i], order[i]))
             return report(instance, ERROR, function, "no input has value reference %u",
                           (unsigned)reference[i]);
+        run = run_of_one_order(&reference[i], &order[i], n - i);
     }
-    for (size_t i = 0; i < n; ++i)
-        *behaviour.input_derivative(instance->state, reference[i], order[i]) = value[i];
+    for (size_t i = 0; i < n; i += run) {
+        run = run_of_one_order(&reference[i], &order[i], n - i);
+        memcpy(behaviour.input_derivative(instance->state, reference[i], order[i]), &value[i],
+               run * sizeof *value);
+    }
     return OK;
 }
 

@@ -25,6 +25,15 @@ static Variable find(void *block, Type type, uint32_t reference)
     return (Variable){0};
 }
 
+static size_t side_by_side(Type type, uint32_t reference)
+{
+    if (type == FLOAT64 && reference < VARIABLES)
+        return VARIABLES - reference;
+    if (type == FLOAT64 && reference >= FIRST_OUTPUT && reference < FIRST_OUTPUT + VARIABLES)
+        return FIRST_OUTPUT + VARIABLES - reference;
+    return 1;
+}
+
 static double *input_derivative(void *block, uint32_t reference, int order)
 {
     State *state = block;
@@ -58,6 +67,7 @@ static Outcome step_all(void *block, void *hidden, Step *step)
 const Behaviour behaviour = {.state_size = sizeof(State),
                              .start = start,
                              .find = find,
+                             .side_by_side = side_by_side,
                              .input_derivative = input_derivative,
                              .output_derivative = output_derivative,
                              .step = step_all};
