@@ -241,13 +241,11 @@ class StepInputs(NamedTuple):
 
 def _line(newest: FloatArray, older: FloatArray, span: float, step_size: float) -> StepInputs:
     """Straight lines through two points ``span`` [s] apart, in a step from the newest one."""
-    known = np.empty((2, len(newest)))
-    known[0] = newest
-    np.subtract(newest, older, known[1])  # of constant inputs exactly zero, and so are the slopes
-    slope = 1.0 / span
-    rows = np.array((1.0, 0.0, 0.0, slope, 1.0, step_size * slope, 0.0, slope))
-    found = rows.reshape(4, 2).dot(known)
-    return StepInputs(found[:2], found[2:])
+    slope = newest - older
+    slope /= span
+    end = slope * step_size
+    end += newest
+    return StepInputs(np.array((newest, slope)), np.array((end, slope)))
 
 
 def _nodes(offsets: Nodes, begin: int, polynomial: InputPolynomial) -> Nodes:
