@@ -66,8 +66,6 @@ class ErrorControl:
 
     Attributes:
         outputs: how many outputs ERR is the mean of.
-        exponent: P of some polynomials: k + 1 if an output depends directly on extrapolated
-            inputs, else k + 2.
     """
 
     def __init__(
@@ -97,7 +95,11 @@ class ErrorControl:
         self._combination_of_output = np.array(index, dtype=np.intp)
         used = frozenset[int]().union(*scheme.output_kinds)
         self._used_kinds = sorted(used)
-        self.exponent = lru_cache(self._exponent)
+        self._exponents = lru_cache(self._exponent)
+
+    def exponent(self, polynomials: Polynomials) -> int:
+        """P: k + 1 if an output depends directly on extrapolated inputs, else k + 2."""
+        return self._exponents(polynomials)
 
     def _exponent(self, polynomials: Polynomials) -> int:
         order = min([polynomials[i].order for i in self._used_kinds], default=0)
