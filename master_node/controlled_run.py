@@ -6,7 +6,7 @@ What is tried next is a value (`Position`), so a rejected step is one that is no
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from master_node.double_step import DoubleStep, DoubleStepper
 from master_node.error_control import ErrorControl, StepError
@@ -21,7 +21,7 @@ from master_node.numerics.discontinuities import (
 )
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import ErrorEstimator
-from master_node.numerics.extrapolation import CouplingHistory, Polynomials
+from master_node.numerics.extrapolation import CouplingHistory, Polynomials, highest
 from master_node.numerics.initial_step_size import initial_step_size, trial_step_size
 from master_node.numerics.landing_points import LandingPoints
 from master_node.numerics.order_control import DEPTH, OrderMemory
@@ -45,8 +45,7 @@ _INF = float("inf")
 _TRIALS = 5
 
 
-@dataclass(frozen=True, slots=True)
-class Position:
+class Position(NamedTuple):
     """Where a run stands and what it will try next.
 
     Attributes:
@@ -111,7 +110,7 @@ class ControlledRun:
         self._searches_changes = settings.discontinuities and coupled.discrete.holds_inputs
         self._stepper = self._make_stepper(context, estimator)
         self._control = self._make_control(context, estimator)
-        self._defects = InputDefects(coupled, scheme, self._control)
+        self._defects = InputDefects(coupled, scheme)
         present, past = EXPONENTS[settings.controller]
         self._controller = StepSizeController(
             settings.alpha,
@@ -198,7 +197,7 @@ class ControlledRun:
         step_size = self._controller.bounded(position.step_size)
         if settings.rests_before_start:
             history = CouplingHistory.at_rest(self._start, u, depth, step_size)
-        return replace(position, history=history, step_size=step_size)
+        return position._replace(history=history, step_size=step_size)
 
     def _depth(self, points: int) -> int:
         """How many communication points are kept for polynomials through ``points`` points."""
@@ -213,7 +212,7 @@ class ControlledRun:
     def _with_initial_step_size(self, position: Position, largest: float) -> Position:
         """The position with H from the behaviour of the slaves there, ``largest`` at most [s]."""
         y, stop = position.outputs.y, self._settings.end
-        scale = 1.0 / self._control.weights(y[0])
+        scale = self._control.scale(y[0])
         slope = y[1] if len(y) > 1 else None
         trial = trial_step_size(y[0], slope, scale, stop - self._start)
         deadlines = 0
@@ -241,9 +240,9 @@ class ControlledRun:
                         exponent=self._control.exponent(polynomials),
                     )
                     bounded = self._controller.bounded(min(step_size, largest))
-                    return replace(position, step_size=bounded)
+                    return position._replace(step_size=bounded)
             trial = 0.1 * times.first
-        return replace(position, step_size=self._controller.bounded(trial))
+        return position._replace(step_size=self._controller.bounded(trial))
 
     def _polynomials(self, position: Position) -> Polynomials:
         points = self._estimator.available(len(position.history.times))
@@ -256,8 +255,9 @@ class ControlledRun:
         wanted = step_within(
             position.bracket, position.time, position.step_size, self._limits.smallest
         )
-        nearer = (position.event, position.unchanged)
-        target = min([target, *(time for time in nearer if time is not None)])
+        for nearer in (position.event, position.unchanged):
+            if nearer is not None:
+                target = min(target, nearer)
         target = self._landing_points.target(
             position.time, wanted, target, first=position.controller.rejected
         )
@@ -270,7 +270,7 @@ class ControlledRun:
         event = self._event(position, step)
         defects, jumps = None, False
         if self._settings.discontinuities:
-            defects = self._defects.of(step, position.history, position.outputs.y, position.smooth)
+            defects = self._defects.of(step, error.scale, position.history, position.smooth)
             jumps = (
                 position.bracket.shows_jump(defects)
                 or has_jumped_unnoticed(defects)
@@ -299,10 +299,10 @@ class ControlledRun:
         self._stepper.accepted()
         self._checkpoints.settle()
         times, polynomials = step.times, step.polynomials
-        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
+        history = step.history.pushed(times.end, step.end_inputs)
         reached = _reached(step)
-        order = max(polynomial.order for polynomial in polynomials)
-        self._tell_accepted(step, error, reached, self._results.reached(reached, order))
+        points = self._results.reached(reached, highest(polynomials).order)
+        self._tell_accepted(step, error, reached, points)
         if self._event(position, step):
             self._statistics.discontinuities += 1
             self._results.cut(reached[-1])
@@ -362,14 +362,14 @@ class ControlledRun:
         if kink is not None:  # the double step up to there is smooth
             following = max(following, (kink - times.begin) / 2.0)
         if defects is None:
-            return replace(position, step_size=following, controller=controller)
+            return position._replace(step_size=following, controller=controller)
         is_search = bracket.end is not None or not is_noticed
         if not is_search and not does_not_shrink(bracket, times.first, defects):
             if bracket.rejected is None:
                 bracket = bracket._replace(rejected=(times.first, defects.largest))
-            return replace(position, step_size=following, controller=controller, bracket=bracket)
+            return position._replace(step_size=following, controller=controller, bracket=bracket)
         self._statistics.double_steps_at_discontinuities += 1
-        return replace(position, bracket=bracket.after_rejection(times, defects))
+        return position._replace(bracket=bracket.after_rejection(times, defects))
 
     def _after_failure(
         self,
@@ -391,8 +391,7 @@ class ControlledRun:
         self._tell_rejected(times, polynomials, _INF, failed.reason)
         if self._is_smallest(times, target):
             raise error or self._stuck_for(failed.reason, times)
-        return replace(
-            position,
+        return position._replace(
             step_size=self._controller.after_discard(times.first, failed.reached),
             controller=position.controller._replace(rejected=True),
             errors_in_a_row=errors_in_a_row,
@@ -416,7 +415,7 @@ class ControlledRun:
                 step_size=times.first,
                 remedy="the model may have an error in its event handling",
             )
-        return replace(position, event=failed.time)
+        return position._replace(event=failed.time)
 
     def _is_smallest(self, times: DoubleStepTimes, target: float) -> bool:
         """Whether no smaller H leads from T_n to ``target`` [s]."""
@@ -474,7 +473,7 @@ class ControlledRun:
         reached = _reached(step)
         error = error._replace(limiting_variable=name)
         self._tell_accepted(step, error, reached, self._results.jumped(reached))
-        history = step.history.pushed(times.end, self._coupled.inputs_of(step.end))
+        history = step.history.pushed(times.end, step.end_inputs)
         return self._behind_event(position, step, history)
 
     def _behind_event(
@@ -512,12 +511,14 @@ class ControlledRun:
             if not name or error.norm <= 1.0:
                 return None
         step_size = self._controller.bounded(step_size)
-        return name, replace(position, step_size=step_size, unchanged=unchanged)
+        return name, position._replace(step_size=step_size, unchanged=unchanged)
 
     def _event(self, position: Position, step: DoubleStep) -> str:
         """What changed at once in a double step, in words; "" if nothing did."""
         if position.event is not None and step.times.end >= position.event:
             return "event"
+        if not self._coupled.discrete.holds_inputs:
+            return ""
         d_middle, d_end = step.discrete
         changed = self._coupled.discrete.changed
         begin, middle, end, _, _ = step.times
@@ -530,15 +531,21 @@ class ControlledRun:
     def _tell_accepted(
         self, step: DoubleStep, error: StepError, reached: Reached, points: Points
     ) -> None:
-        count_accepted(self._statistics, step.times.first, reached)
-        attempt = _attempt(step.times, step.polynomials, error.norm, error.limiting_variable)
-        self._observer.attempted(attempt._replace(accepted=True, points=points))
+        times, (order, slopes) = step.times, highest(step.polynomials)
+        count_accepted(self._statistics, times.first, reached)
+        limiting = error.limiting_variable
+        self._observer.attempted(
+            Attempt(times.begin, times.first, order, slopes, error.norm, True, limiting, points)
+        )
 
     def _tell_rejected(
         self, times: DoubleStepTimes, polynomials: Polynomials, norm: float, reason: str
     ) -> None:
         self._statistics.rejected_double_steps += 1
-        self._observer.attempted(_attempt(times, polynomials, norm, reason))
+        order, slopes = highest(polynomials)
+        self._observer.attempted(
+            Attempt(times.begin, times.first, order, slopes, norm, False, reason)
+        )
 
 
 def _reached(step: DoubleStep) -> Reached:
@@ -551,18 +558,3 @@ def _reached(step: DoubleStep) -> Reached:
 
 def _end(step: DoubleStep) -> Outputs:
     return Outputs(step.end, step.discrete[1])
-
-
-def _attempt(
-    times: DoubleStepTimes, polynomials: Polynomials, norm: float, limiting_variable: str
-) -> Attempt:
-    """What observers are told of an attempt; not accepted, unless that is put in its place."""
-    return Attempt(
-        times.begin,
-        times.first,
-        max(polynomial.order for polynomial in polynomials),
-        max(polynomial.derivative_points for polynomial in polynomials),
-        norm,
-        False,
-        limiting_variable,
-    )

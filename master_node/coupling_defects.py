@@ -21,6 +21,7 @@ from master_node.numerics.defect_control import TARGET, foreseen_step_size, larg
 from master_node.numerics.discontinuities import Defects, has_jumped_unnoticed
 from master_node.numerics.error_estimators import node_polynomial
 from master_node.numerics.extrapolation import CouplingHistory, Extrapolation, Polynomials
+from master_node.numerics.norms import error_scale
 from master_node.system import CoupledSystem
 from protocol.signals import FloatArray
 
@@ -255,12 +256,12 @@ class CouplingDefects:
         """
         return max(1, len(history.times) - 1)
 
-    def weights(self, y: FloatArray) -> FloatArray:
-        """1 / (ATOL_j + RTOL_j |y_j|) of equation (8), shape (m,)."""
-        return 1.0 / (self._absolute_tolerance + self._relative_tolerance * np.abs(y))
+    def scale(self, y: FloatArray) -> FloatArray:
+        """ATOL_j + RTOL_j |y_j| of equation (8), shape (m,), unit [y]."""
+        return error_scale(y, self._absolute_tolerance, self._relative_tolerance)
 
-    def _weights_of_inputs(self, y: FloatArray) -> FloatArray:
-        return self._coupled.weights_of_inputs(self.weights(y))[self._inputs]
+    def _scale_of_inputs(self, y: FloatArray) -> FloatArray:
+        return self._coupled.scale_of_inputs(self.scale(y))[self._inputs]
 
     def judge(
         self,
@@ -281,8 +282,8 @@ class CouplingDefects:
         if not inputs.size:
             return CouplingError(0.0, "", has_jumped=False)
         measured = self._shape.measure(history, polynomials, reached)
-        weights = self._weights_of_inputs(y)
-        weighted = measured.defects[inputs] * weights
+        scale = self._scale_of_inputs(y)
+        weighted = measured.defects[inputs] / scale
         index = int(weighted.argmax())
         norm = sqrt(weighted.dot(weighted) / len(weighted))
         has_jumped = False
@@ -290,8 +291,8 @@ class CouplingDefects:
             defects = Defects(
                 0.0,
                 float(weighted[index]),
-                max(TARGET, self._foreseen(history, polynomials, reached[0][0], weights, index)),
-                float(measured.changes[inputs[index]] * weights[index]),
+                max(TARGET, self._foreseen(history, polynomials, reached[0][0], scale, index)),
+                float(measured.changes[inputs[index]] / scale[index]),
                 int(inputs[index]),
             )
             has_jumped = has_jumped_unnoticed(defects)
@@ -302,7 +303,7 @@ class CouplingDefects:
         history: CouplingHistory,
         polynomials: Polynomials,
         time: float,
-        weights: FloatArray,
+        scale: FloatArray,
         index: int,
     ) -> float:
         """The weighted defect of one input that was foreseen for a (small) step to ``time``."""
@@ -311,7 +312,7 @@ class CouplingDefects:
             return _INF
         now = history.times[0]
         reach = self._shape.reach(history.times, polynomials, time - now)
-        return float(sizes[index] * weights[index] * reach[self._kinds[index]])
+        return float(sizes[index] / scale[index] * reach[self._kinds[index]])
 
     def step_size(
         self,
@@ -336,7 +337,7 @@ class CouplingDefects:
         sizes = self._sizes(history, polynomials)
         if sizes is None:
             return smallest
-        weighted = sizes * self._weights_of_inputs(y)
+        weighted = sizes / self._scale_of_inputs(y)
         squares = np.bincount(
             self._kinds, np.square(weighted), len(self._extrapolation.kinds)
         ).tolist()

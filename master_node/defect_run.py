@@ -12,7 +12,12 @@ from dataclasses import dataclass, replace
 
 from master_node.coupling_defects import CouplingDefects, CouplingError, SingleStep
 from master_node.numerics.double_step_times import DoubleStepTimes
-from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial, Polynomials
+from master_node.numerics.extrapolation import (
+    CouplingHistory,
+    InputPolynomial,
+    Polynomials,
+    highest,
+)
 from master_node.numerics.initial_step_size import untried_step_size
 from master_node.numerics.order_control import (
     DEPTH,
@@ -149,7 +154,7 @@ class DefectRun:
         return untried_step_size(
             y[0],
             y[1] if len(y) > 1 and self._scheme.has_derivative.all() else None,
-            1.0 / self._coupling.weights(y[0]),
+            self._coupling.scale(y[0]),
             self._settings.end - self._start,
         )
 
@@ -278,12 +283,5 @@ class DefectRun:
 
 def _attempt(time: float, size: float, polynomials: Polynomials, error: CouplingError) -> Attempt:
     """What observers are told of a step, but for the points that it reached."""
-    return Attempt(
-        time,
-        size,
-        max(polynomial.order for polynomial in polynomials),
-        max(polynomial.derivative_points for polynomial in polynomials),
-        error.norm,
-        True,
-        error.limiting_variable,
-    )
+    order, slopes = highest(polynomials)
+    return Attempt(time, size, order, slopes, error.norm, True, error.limiting_variable)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import isfinite
 from typing import Any
 
 from master_node.coupling_scheme import CouplingScheme
 from master_node.discrete_coupling import DiscreteValues
 from master_node.slave_group import Program, SlaveGroup
-from master_node.step_requests import BrokenOffError, FailedStep, Piece, StepRequests
+from master_node.step_requests import (
+    BrokenOffError,
+    FailedStep,
+    Piece,
+    RequestForm,
+    StepForm,
+    StepRequests,
+)
 from master_node.system import CoupledSystem
 from protocol.calls import Call, DoStep, GetDiscreteOutputs, GetOutputs, SetDiscreteInputs
 from protocol.signals import FloatArray
@@ -48,11 +55,11 @@ class DiscreteStepRequests(StepRequests):
         self._sets = [bool(part.discrete_inputs) for part in coupled.parts]
 
     def _program(
-        self, slave: int, pieces: Sequence[Piece], inputs: Sequence[FloatArray]
+        self, slave: int, form: RequestForm, pieces: Sequence[Piece], inputs: Sequence[FloatArray]
     ) -> Program:
         calls: list[Call] = []
         steps = iter(pieces)
-        for call in super()._program(slave, pieces, inputs):
+        for call in super()._program(slave, form, pieces, inputs):
             if type(call) is DoStep and self._sets[slave]:
                 calls.append(SetDiscreteInputs(next(steps).held[slave]))
             calls.append(call)
@@ -60,22 +67,23 @@ class DiscreteStepRequests(StepRequests):
                 calls.append(_GET_DISCRETE_OUTPUTS)
         return tuple(calls)
 
-    def _places(self, pieces: Sequence[Piece]) -> Sequence[Sequence[int]]:
-        (common, *_) = super()._places(pieces)
+    def _places(self, steps: Sequence[StepForm]) -> Sequence[Sequence[int]]:
+        (common, *_) = super()._places(steps)
         return [
             [place + sets * (number + 1) + reads * number for number, place in enumerate(common)]
             for sets, reads in zip(self._sets, self._reads, strict=True)
         ]
 
     def _discrete_outputs(
-        self, answers: Mapping[int, list[object]], places: Sequence[Sequence[int]]
+        self, answers: Sequence[list[Any] | None], places: Sequence[Sequence[int]]
     ) -> list[DiscreteValues]:
         found = []
         for number in range(len(places[0])):
             d: list[Any] = []
             for slave, columns in enumerate(self._discrete.output_slices):
-                if slave in answers and self._reads[slave]:
-                    d += answers[slave][places[slave][number] + 1]  # type: ignore[arg-type]
+                results = answers[slave]
+                if results is not None and self._reads[slave]:
+                    d += results[places[slave][number] + 1]
                 else:
                     d += [None] * (columns.stop - columns.start)
             self._check_finite(d)

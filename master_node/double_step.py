@@ -28,7 +28,7 @@ from master_node.discrete_coupling import DiscreteValues
 from master_node.discrete_step_requests import step_requests
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import Comparison, ErrorEstimator
-from master_node.numerics.extrapolation import CouplingHistory, Polynomials
+from master_node.numerics.extrapolation import CouplingHistory, Polynomials, StepInputs
 from master_node.outputs import NO_OUTPUTS, Outputs
 from master_node.slave_group import SlaveGroup
 from master_node.step_requests import (
@@ -37,13 +37,13 @@ from master_node.step_requests import (
     SAVE_HALFWAY,
     BrokenOffError,
     FailedStep,
-    Inputs,
     Piece,
+    StepForm,
 )
 from master_node.system import CoupledSystem
-from protocol.calls import Call, DoStep, GetOutputs
+from protocol.calls import DoStep, GetOutputs
 from protocol.errors import StepRejectedError
-from protocol.signals import FloatArray, InputSignal
+from protocol.signals import FloatArray
 
 
 class DoubleStep(NamedTuple):
@@ -58,7 +58,8 @@ class DoubleStep(NamedTuple):
         middle, end: outputs of the two small steps at T_n + H and T_n + 2H.
         comparison: values of the comparison solution at T_n + 2H, shape (m,).
         history: inputs at the communication points up to T_n + H.
-        signals: the inputs of both small steps.
+        end_inputs: at T_n + 2H, shape (rows, n).
+        foreseen: the inputs at T_n + H and T_n + 2H as their polynomials said, shape (n,) each.
         discrete: discrete outputs at T_n + H and T_n + 2H.
     """
 
@@ -68,7 +69,8 @@ class DoubleStep(NamedTuple):
     end: FloatArray
     comparison: FloatArray
     history: CouplingHistory
-    signals: tuple[InputSignal, InputSignal]
+    end_inputs: FloatArray
+    foreseen: tuple[FloatArray, FloatArray]
     discrete: tuple[DiscreteValues, DiscreteValues] = ((), ())
 
 
@@ -94,10 +96,17 @@ class DoubleStepper:
         self._scheme = scheme
         self._is_long_step = estimator.comparison is Comparison.LONG_STEP
         self._requests = step_requests(group, coupled, scheme)
-        solution = (scheme.get_outputs, scheme.output_rows)
-        values_only = ([GetOutputs()] * len(coupled.parts), 1)
-        self._solution = solution
-        self._comparison = solution if scheme.known_ahead else values_only
+        forms = self._requests.forms
+        solution, comparison = scheme.get_outputs, (GetOutputs(),) * len(coupled.parts)
+        if scheme.known_ahead:
+            comparison = solution
+        if self._is_long_step:
+            first = forms(StepForm(None, comparison), StepForm((RESTORE_POINT,), solution))
+            second = forms(StepForm((), solution))
+        else:
+            first = forms(StepForm(None, solution), StepForm((SAVE_HALFWAY,), comparison))
+            second = forms(StepForm((RESTORE_HALFWAY,), solution))
+        self._first_request, self._second_request = first, second
 
     def attempt(
         self,
@@ -145,77 +154,77 @@ class DoubleStepper:
         external = self._external.over(begin, middle)
         external_second = self._external.over(middle, end)
         external_long = self._external.over(begin, end)
-        signals: dict[str, InputSignal] = {}
+        in_first: StepInputs
+        in_second: StepInputs
 
-        def inputs_of(step: str, past: CouplingHistory, time: float) -> Inputs:
-            def inputs(known: FloatArray) -> FloatArray:
-                signals[step] = self._signal(past, polynomials, time, known)
-                return signals[step].derivatives
+        def first_inputs(known: FloatArray) -> FloatArray:
+            nonlocal in_first
+            in_first = self._inputs(history, polynomials, (begin, middle), first, known)
+            return in_first.begin
 
-            return inputs
+        def second_inputs(known: FloatArray) -> FloatArray:
+            nonlocal in_second
+            in_second = self._inputs(pushed, polynomials, (middle, end), second, known)
+            return in_second.begin
 
-        step = DoStep(begin, first, True)
-        first_inputs = inputs_of("first", history, middle)
+        small_piece = Piece(first_inputs, external, held, DoStep(begin, first, True))
         if self._is_long_step:
-            past = history.every_second()
+            past, size = history.every_second(), first + second
             comparison_piece = Piece(
-                None,
-                inputs_of("long", past, end),
+                lambda known: self._inputs(past, polynomials, (begin, end), size, known).begin,
                 external_long,
                 held,
-                DoStep(begin, first + second, True),
-                *self._comparison,
+                DoStep(begin, size, True),
             )
-            small_piece = Piece(
-                (RESTORE_POINT,), first_inputs, external, held, step, *self._solution
+            comparison, at_middle = self._requests.take(
+                self._first_request, (comparison_piece, small_piece)
             )
-            comparison, at_middle = self._requests.take([comparison_piece, small_piece])
-            before_second: tuple[Call, ...] = ()
         else:
-            past = history
-            small_piece = Piece(None, first_inputs, external, held, step, *self._solution)
             comparison_piece = Piece(
-                (SAVE_HALFWAY,),
-                lambda _: signals["first"].shifted(first).derivatives,
+                lambda _: in_first.end,
                 external_long.shifted(first),
                 held,
                 DoStep(middle, second, False),
-                *self._comparison,
             )
-            at_middle, comparison = self._requests.take([small_piece, comparison_piece])
-            before_second = (RESTORE_HALFWAY,)
+            at_middle, comparison = self._requests.take(
+                self._first_request, (small_piece, comparison_piece)
+            )
 
         y_middle = at_middle.y
         d_middle = discrete.filled(at_middle.d, outputs.d)
         pushed = history.pushed(middle, self._coupled.inputs_of(y_middle))
         second_piece = Piece(
-            before_second,
-            inputs_of("second", pushed, end),
+            second_inputs,
             external_second,
             discrete.held(y_middle[0], d_middle, middle),
             DoStep(middle, second, False),
-            *self._solution,
         )
-        (at_end,) = self._requests.take([second_piece])
+        (at_end,) = self._requests.take(self._second_request, (second_piece,))
         return DoubleStep(
-            times=times,
-            polynomials=polynomials,
-            middle=y_middle,
-            end=at_end.y,
-            comparison=comparison.y[0],
-            history=pushed,
-            signals=(signals["first"], signals["second"]),
-            discrete=(d_middle, discrete.filled(at_end.d, d_middle)),
+            times,
+            polynomials,
+            y_middle,
+            at_end.y,
+            comparison.y[0],
+            pushed,
+            self._coupled.inputs_of(at_end.y),
+            (in_first.end[0], in_second.end[0]),
+            (d_middle, discrete.filled(at_end.d, d_middle)),
         )
 
-    def _signal(
-        self, history: CouplingHistory, polynomials: Polynomials, time: float, known: FloatArray
-    ) -> InputSignal:
-        """Around the newest point of ``history``, with what is ``known`` at the later ``time``."""
+    def _inputs(
+        self,
+        history: CouplingHistory,
+        polynomials: Polynomials,
+        ends: tuple[float, float],
+        step_size: float,
+        known: FloatArray,
+    ) -> StepInputs:
+        """In a step from the newest point of ``history``, with what is ``known`` at its end."""
         ahead = self._scheme.known_ahead
         if ahead:
-            history = history.pushed(time, self._coupled.inputs_of(known))
-        return self._scheme.extrapolation.signal(history, polynomials, ahead)
+            history = history.pushed(ends[1], self._coupled.inputs_of(known))
+        return self._scheme.extrapolation.in_step(history, polynomials, step_size, ahead)
 
 
 class PartialDoubleStepper(DoubleStepper):
@@ -254,10 +263,16 @@ class PartialDoubleStepper(DoubleStepper):
         self._from_begin = self._scheme.extrapolation.signal(history, polynomials)
         return super()._attempt(history, times, polynomials, outputs)
 
-    def _signal(
-        self, history: CouplingHistory, polynomials: Polynomials, time: float, known: FloatArray
-    ) -> InputSignal:
-        derivatives = super()._signal(history, polynomials, time, known).derivatives
-        late = self._from_begin.shifted(history.times[0] - self._begin).derivatives
-        derivatives[:, self._late_inputs] = late[:, self._late_inputs]
-        return InputSignal(derivatives)
+    def _inputs(
+        self,
+        history: CouplingHistory,
+        polynomials: Polynomials,
+        ends: tuple[float, float],
+        step_size: float,
+        known: FloatArray,
+    ) -> StepInputs:
+        found = super()._inputs(history, polynomials, ends, step_size, known)
+        for derivatives, time in zip(found, ends, strict=True):
+            late = self._from_begin.shifted(time - self._begin).derivatives
+            derivatives[:, self._late_inputs] = late[:, self._late_inputs]
+        return found

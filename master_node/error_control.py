@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from master_node.coupling_scheme import CouplingScheme
 from master_node.double_step import DoubleStep
 from master_node.numerics.error_estimators import Comparison, ErrorEstimator, exact_ratio
 from master_node.numerics.extrapolation import Nodes, Polynomials
-from master_node.numerics.norms import first_not_finite, weighted_rms_norm
+from master_node.numerics.norms import error_scale, first_not_finite, weighted_rms_norm
 from master_node.system import CoupledSystem
 from protocol.signals import FloatArray
 
@@ -35,14 +36,23 @@ class StepError(NamedTuple):
     """The estimated error of a double step.
 
     Attributes:
-        estimate: EST, shape (m,), unit [y].
+        difference: of the two small steps from the comparison solution, shape (m,), unit [y].
+        ratio: p, one for all outputs or one for each, shape (m,).
+        scale: ATOL_j + RTOL_j |y_j| of equation (8), shape (m,), unit [y].
         norm: ERR of equation (8); inf when a value is not finite.
         limiting_variable: ``slave.variable`` with the largest part in ERR.
     """
 
-    estimate: FloatArray
+    difference: FloatArray
+    ratio: FloatArray | float
+    scale: FloatArray
     norm: float
     limiting_variable: str
+
+    @property
+    def estimate(self) -> FloatArray:
+        """EST, shape (m,), unit [y]."""
+        return ErrorEstimator.estimate(self.difference, self.ratio)
 
 
 class ErrorControl:
@@ -69,7 +79,6 @@ class ErrorControl:
         self._names = coupled.output_names
         self._absolute_tolerance = coupled.absolute_tolerance
         self._relative_tolerance = coupled.relative_tolerance
-        self._estimate = estimator.estimate
         self._extrapolation = scheme.extrapolation
         self._known_ahead = scheme.known_ahead
         self._is_long_step = estimator.comparison is Comparison.LONG_STEP
@@ -82,61 +91,73 @@ class ErrorControl:
             if (kinds, direct) not in combinations:
                 combinations.append((kinds, direct))
             index.append(combinations.index((kinds, direct)))
-        self._combinations = combinations
+        self._combinations = [(tuple(kinds), direct) for kinds, direct in combinations]
         self._combination_of_output = np.array(index, dtype=np.intp)
         used = frozenset[int]().union(*scheme.output_kinds)
         self._used_kinds = sorted(used)
+        self._exponents = lru_cache(self._exponent)
 
     def exponent(self, polynomials: Polynomials) -> int:
         """P: k + 1 if an output depends directly on extrapolated inputs, else k + 2."""
+        return self._exponents(polynomials)
+
+    def _exponent(self, polynomials: Polynomials) -> int:
         order = min([polynomials[i].order for i in self._used_kinds], default=0)
         return order + (1 if self._has_feed_through else 2)
 
     def judge(self, step: DoubleStep) -> StepError:
         """EST and ERR of a double step."""
         y = step.end[0]
-        error = self._estimate(y, step.comparison, self._ratios(step))
-        norm, index = self._norm(error, y)
+        scale, ratio = self.scale(y), self._ratios(step)
+        difference = y - step.comparison
+        if isinstance(ratio, float):
+            norm, index = self._norm(difference, scale)
+            norm /= abs(1.0 - ratio)
+        else:
+            norm, index = self._norm(ErrorEstimator.estimate(difference, ratio), scale)
         limiting = self._names[index]
-        bad = first_not_finite(step.end)
-        if bad is not None:
-            return StepError(error, _INF, f"{self._names[bad]} is not finite")
-        return StepError(error, norm, limiting)
+        if len(step.end) > 1 or not norm < _INF:
+            bad = first_not_finite(step.end)
+            if bad is not None:
+                norm, limiting = _INF, f"{self._names[bad]} is not finite"
+        return StepError(difference, ratio, scale, norm, limiting)
 
-    def _norm(self, error: FloatArray, y: FloatArray) -> tuple[float, int]:
+    def _norm(self, error: FloatArray, scale: FloatArray) -> tuple[float, int]:
         """ERR, and the index of the output with most of it."""
-        return weighted_rms_norm(error, y, self._absolute_tolerance, self._relative_tolerance)
+        return weighted_rms_norm(error, scale)
 
-    def weights(self, y: FloatArray) -> FloatArray:
-        """1 / (ATOL_j + RTOL_j |y_j|) of equation (8), shape (m,)."""
-        return 1.0 / (self._absolute_tolerance + self._relative_tolerance * np.abs(y))
+    def scale(self, y: FloatArray) -> FloatArray:
+        """ATOL_j + RTOL_j |y_j| of equation (8), shape (m,), unit [y]."""
+        return error_scale(y, self._absolute_tolerance, self._relative_tolerance)
 
     def nodes(self, step: DoubleStep) -> StepNodes:
         """Where the polynomials of a double step met their inputs."""
         polynomials, ahead = step.polynomials, self._known_ahead
         begin, middle, end, _, _ = step.times
-        past = step.history.times
+        nodes_at = self._extrapolation.nodes_at
+        past = tuple([time - begin for time in step.history.times])
         before = past[1:]
-
-        def nodes(points: tuple[float, ...], known: float) -> list[Nodes]:
-            points = (known, *points) if ahead else points
-            return self._extrapolation.nodes(points, polynomials, begin, ahead)
-
-        first = nodes(before, middle)
-        comparison = nodes(before[::2], end) if self._is_long_step else first
-        return StepNodes(first, nodes(past, end), comparison)
+        to_middle, to_end = ((middle - begin,), (end - begin,)) if ahead else ((), ())
+        first = nodes_at(to_middle + before, polynomials, ahead)
+        second = nodes_at(to_end + past, polynomials, ahead)
+        if not self._is_long_step:
+            return StepNodes(first, second, first)
+        return StepNodes(first, second, nodes_at(to_end + before[::2], polynomials, ahead))
 
     def _ratios(self, step: DoubleStep) -> FloatArray | float:
         """P of each output, or one for all."""
-        if self._paper_ratios is not None:
+        paper = self._paper_ratios
+        if paper is not None:
             ratios = [
-                self._paper_ratios[min([step.polynomials[i].order for i in kinds], default=0)]
+                paper[min([step.polynomials[i].order for i in kinds], default=0)]
                 for kinds, _ in self._combinations
             ]
         else:
             nodes = self.nodes(step)
+            begin, middle, end, _, _ = step.times
+            middle, end = middle - begin, end - begin
             ratios = [
-                self._exact_ratio(step, nodes, kinds, direct)
+                self._exact_ratio(nodes, middle, end, kinds, direct)
                 for kinds, direct in self._combinations
             ]
         if len(ratios) == 1:
@@ -144,34 +165,30 @@ class ErrorControl:
         return np.array(ratios)[self._combination_of_output]
 
     def _exact_ratio(
-        self, step: DoubleStep, nodes: StepNodes, kinds: frozenset[int], direct: bool
+        self, nodes: StepNodes, middle: float, end: float, kinds: tuple[int, ...], direct: bool
     ) -> float:
-        """P of an output whose slave has inputs of these kinds.
+        """P of an output whose slave has inputs of these kinds; offsets from T_n [s].
 
         Several kinds have several constants, and which part of the error comes from which input
         is not known: the one that makes the estimate largest is taken.
         """
-        origin = step.times.begin
-        middle, end = step.times.middle - origin, step.times.end - origin
-        candidates = [
-            exact_ratio(
-                nodes.first[i],
-                nodes.second[i],
-                nodes.comparison[i],
-                middle,
-                end,
-                feed_through=direct and not self._ahead[i],
+        found, furthest = 2.0, _INF
+        first, second, comparison = nodes
+        for i in kinds:
+            feed_through = direct and not self._ahead[i]
+            p = exact_ratio(
+                first[i], second[i], comparison[i], middle, end, feed_through=feed_through
             )
-            for i in kinds
-        ]
-        return min(candidates, key=lambda p: abs(1.0 - p), default=2.0)
+            if abs(1.0 - p) < furthest:
+                found, furthest = p, abs(1.0 - p)
+        return found
 
 
 class PartialErrorControl(ErrorControl):
     """The same over the outputs of the slaves that take double steps, where not all do.
 
     The others have not taken their steps when a double step is judged: their outputs do not count,
-    and have the weight 0.
+    and have an infinite scale.
 
     Args:
         coupled: the system, with its tolerances.
@@ -190,22 +207,18 @@ class PartialErrorControl(ErrorControl):
         super().__init__(coupled, scheme, estimator, constants)
         takes_part = ~np.isin(coupled.output_slave, scheme.late_slaves)
         self._counted = np.flatnonzero(takes_part)
-        self._counts = takes_part.astype(float)
+        self._not_counted = np.flatnonzero(~takes_part)
         self.outputs = len(self._counted)
 
-    def weights(self, y: FloatArray) -> FloatArray:
-        """See `ErrorControl`; 0 for outputs that do not count."""
-        weights: FloatArray = super().weights(y) * self._counts
-        return weights
+    def scale(self, y: FloatArray) -> FloatArray:
+        """See `ErrorControl`; infinite for outputs that do not count."""
+        scale = super().scale(y)
+        scale[self._not_counted] = _INF
+        return scale
 
-    def _norm(self, error: FloatArray, y: FloatArray) -> tuple[float, int]:
+    def _norm(self, error: FloatArray, scale: FloatArray) -> tuple[float, int]:
         counted = self._counted
         if not counted.size:
             return 0.0, 0
-        norm, index = weighted_rms_norm(
-            error[counted],
-            y[counted],
-            self._absolute_tolerance[counted],
-            self._relative_tolerance[counted],
-        )
+        norm, index = weighted_rms_norm(error[counted], scale[counted])
         return norm, int(counted[index])

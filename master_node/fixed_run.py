@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import ulp
 from typing import NamedTuple
 
-from master_node.numerics.extrapolation import CouplingHistory
+from master_node.numerics.extrapolation import CouplingHistory, highest
 from master_node.numerics.step_size_controller import fixed_steps
 from master_node.observers import Attempt
 from master_node.outputs import Outputs
@@ -84,8 +84,7 @@ class FixedRun:
             history = history.pushed(end, coupled.inputs_of(outputs.y))
             reached = (ReachedPoint(end, *outputs),)
             count_accepted(context.statistics, step.step_size, reached)
-            order = max(polynomial.order for polynomial in polynomials)
-            slopes = max(polynomial.derivative_points for polynomial in polynomials)
+            order, slopes = highest(polynomials)
             points = results.reached(reached, order)
             context.observer.attempted(
                 Attempt(time, step.step_size, order, slopes, _NAN, True, "", points)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from master_node.coupling_scheme import CouplingScheme
 from master_node.double_step import DoubleStep
-from master_node.error_control import ErrorControl
 from master_node.numerics.discontinuities import Defects, measure
 from master_node.numerics.error_estimators import node_polynomial
-from master_node.numerics.extrapolation import CouplingHistory
+from master_node.numerics.extrapolation import CouplingHistory, highest
 from master_node.system import CoupledSystem
 from protocol.signals import FloatArray
 
@@ -18,55 +17,51 @@ class InputDefects:
     Args:
         coupled: the system.
         scheme: how its slaves are coupled.
-        control: its error control, for the weights.
     """
 
-    def __init__(
-        self, coupled: CoupledSystem, scheme: CouplingScheme, control: ErrorControl
-    ) -> None:
+    def __init__(self, coupled: CoupledSystem, scheme: CouplingScheme) -> None:
         self._coupled = coupled
         self._names = coupled.output_names
         self._extrapolation = scheme.extrapolation
         self._known_ahead = scheme.known_ahead
-        self._control = control
 
     def of(
         self,
         step: DoubleStep,
+        scale: FloatArray,
         history: CouplingHistory,
-        y: FloatArray,
         smooth: tuple[float, float] | None,
     ) -> Defects:
         """The defects of a double step.
 
         Args:
             step: the double step.
+            scale: ATOL_j + RTOL_j |y_j| at its end, shape (m,), unit [y].
             history: up to T_n.
-            y: outputs there, shape (rows, m).
             smooth: step size and largest defect of the last accepted step; None: there is none.
         """
-        coupled, times = self._coupled, step.times
-        weights = coupled.weights_of_inputs(self._control.weights(step.end[0]))
-        first, second = step.signals
+        times = step.times
+        input_scale = self._coupled.scale_of_inputs(scale)
+        foreseen_middle, foreseen_end = step.foreseen
         if self._known_ahead:  # interpolated inputs have no defect that would show a jump
-            first = self._extrapolation.signal(history, step.polynomials)
-            second = self._extrapolation.signal(step.history, step.polynomials)
-        u_middle, u_end = coupled.inputs_of(step.middle[0]), coupled.inputs_of(step.end[0])
-        foreseen_middle, foreseen_end = first.at(times.first), second.at(times.second)
-        middle, at_middle = measure(u_middle - foreseen_middle, weights)
-        end, at_end = measure(u_end - foreseen_end, weights)
-        change = foreseen_end - u_middle
-        index = at_end
+            in_step = self._extrapolation.in_step
+            foreseen_middle = in_step(history, step.polynomials, times.first).end[0]
+            foreseen_end = in_step(step.history, step.polynomials, times.second).end[0]
+        u_middle, u_end = step.history.inputs[0][0], step.end_inputs[0]
+        middle, at_middle = measure(u_middle - foreseen_middle, input_scale)
+        end, at_end = measure(u_end - foreseen_end, input_scale)
+        if not max(middle, end) > 1.0:
+            return Defects(middle, end)
+        index, foreseen, before = at_end, foreseen_end, u_middle
         if middle > end:
-            change = foreseen_middle - coupled.inputs_of(y[0])
-            index = at_middle
+            index, foreseen, before = at_middle, foreseen_middle, history.inputs[0][0]
+        change = abs(foreseen[index] - before[index]) / input_scale[index]
         expected = middle * self._growth(step)
         if smooth is not None:
-            before, largest = smooth
-            order = max(polynomial.order for polynomial in step.polynomials)
-            expected = max(expected, largest * (times.first / before) ** (order + 1))
-        foreseen = float(abs(change[index]) * weights[index]) if len(weights) else 0.0
-        return Defects(middle, end, expected, foreseen, index)
+            size, largest = smooth
+            order = highest(step.polynomials).order
+            expected = max(expected, largest * (times.first / size) ** (order + 1))
+        return Defects(middle, end, expected, float(change), index)
 
     def _growth(self, step: DoubleStep) -> float:
         """How much larger a defect at T_n + 2H is than at T_n + H where everything is smooth."""

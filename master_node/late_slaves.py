@@ -19,7 +19,7 @@ from master_node.numerics.extrapolation import CouplingHistory
 from master_node.outputs import Outputs
 from master_node.single_step import remedy_without_rollback, unrepeatable
 from master_node.slave_group import SlaveGroup
-from master_node.step_requests import BrokenOffError, Piece
+from master_node.step_requests import BrokenOffError, Piece, StepForm
 from master_node.system import CoupledSystem
 from protocol.calls import DoStep
 from protocol.signals import FloatArray
@@ -41,6 +41,9 @@ class LateSlaves:
         self._requests = step_requests(
             group, coupled, replace(scheme, groups=(scheme.late_slaves,), evaluated=())
         )
+        form = StepForm((), scheme.get_outputs)
+        self._one_step = self._requests.forms(form)
+        self._two_steps = self._requests.forms(form, form)
         is_late = np.isin(coupled.output_slave, scheme.late_slaves)
         self._outputs = np.flatnonzero(is_late)
         self._send_each_other = coupled.discrete.holds_inputs or any(
@@ -79,18 +82,19 @@ class LateSlaves:
         u_end = self._coupled.inputs_of(step.end)
         try:
             if self._send_each_other:
-                (at_middle,) = self._requests.take([to_middle])
+                (at_middle,) = self._requests.take(self._one_step, [to_middle])
                 y_middle = self._merged(step.middle, at_middle.y)
                 pushed = history.pushed(middle, self._coupled.inputs_of(y_middle))
                 inputs = signal(pushed.pushed(end, u_end), step.polynomials, 1).derivatives
                 d_middle = discrete.filled(at_middle.d, d_middle)
                 held = discrete.held(y_middle[0], d_middle, middle)
-                (late,) = self._requests.take([self._piece(inputs, to_end, held, end)])
+                following = self._piece(inputs, to_end, held, end)
+                (late,) = self._requests.take(self._one_step, [following])
             else:
                 inputs = signal(pushed.pushed(end, u_end), step.polynomials, 1).derivatives
                 held = discrete.held(step.middle[0], d_middle, middle)
                 at_middle, late = self._requests.take(
-                    [to_middle, self._piece(inputs, to_end, held, end)]
+                    self._two_steps, [to_middle, self._piece(inputs, to_end, held, end)]
                 )
                 y_middle = self._merged(step.middle, at_middle.y)
                 d_middle = discrete.filled(at_middle.d, d_middle)
@@ -101,19 +105,18 @@ class LateSlaves:
                 raise
             remedy = remedy_without_rollback(failed.slave)
             raise unrepeatable(failed, to_middle.step, remedy) from failed.error
+        y_end = self._merged(step.end, late.y)
         return step._replace(
             middle=y_middle,
-            end=self._merged(step.end, late.y),
+            end=y_end,
             history=pushed,
+            end_inputs=self._coupled.inputs_of(y_end),
             discrete=(d_middle, discrete.filled(late.d, d_end)),
         )
 
     def _piece(self, inputs: FloatArray, step: DoStep, held: Held, end: float) -> Piece:
-        scheme = self._scheme
         external = self._coupled.external.over(step.communication_point, end)
-        return Piece(
-            (), lambda _: inputs, external, held, step, scheme.get_outputs, scheme.output_rows
-        )
+        return Piece(lambda _: inputs, external, held, step)
 
     def _merged(self, y: FloatArray, late: FloatArray) -> FloatArray:
         """The outputs of the others with those of the late slaves."""

@@ -8,7 +8,6 @@ between the two is judged by its defects afterwards, and bounds the next H.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from master_node.controlled_run import ControlledRun, Position
@@ -83,10 +82,10 @@ class MixedRun(ControlledRun):
         untried = untried_step_size(
             y[0],
             y[1] if len(y) > 1 and self._scheme.has_derivative.all() else None,
-            1.0 / self._coupling.weights(y[0]),
+            self._coupling.scale(y[0]),
             settings.end - self._start,
         )
-        return replace(position, step_size=self._controller.bounded(min(untried, largest)))
+        return position._replace(step_size=self._controller.bounded(min(untried, largest)))
 
     def _accept(
         self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
@@ -100,7 +99,7 @@ class MixedRun(ControlledRun):
             step.end[0],
         )
         if coupling.norm > error.norm:
-            error = StepError(error.estimate, coupling.norm, coupling.limiting_variable)
+            error = error._replace(norm=coupling.norm, limiting_variable=coupling.limiting_variable)
         if not error.norm <= 1.0:
             self._statistics.steps_above_tolerance += 1
         if coupling.has_jumped and self._settings.discontinuities:
@@ -117,7 +116,7 @@ class MixedRun(ControlledRun):
             smallest=min(SMALLEST_FACTOR * taken, following.step_size),
             largest=following.step_size,
         )
-        return replace(following, step_size=self._controller.bounded(bound))
+        return following._replace(step_size=self._controller.bounded(bound))
 
     def _accept_jump(
         self, position: Position, step: DoubleStep, error: StepError, name: str

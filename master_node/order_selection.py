@@ -93,12 +93,11 @@ class OrderSelection:
         """
         coupled = self._coupled
         slaves = len(coupled.parts)
-        weights = self._control.weights(step.end[0])
-        squares = np.bincount(coupled.output_slave, np.square(error.estimate * weights), slaves)
+        squares = np.bincount(coupled.output_slave, np.square(error.estimate / error.scale), slaves)
         magnitudes = input_magnitudes(
             history,
             self._has_derivative,
-            coupled.weights_of_inputs(weights),
+            coupled.scale_of_inputs(error.scale),
             self._slave_of_input,
             slaves,
         )

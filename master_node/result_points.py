@@ -127,7 +127,7 @@ class ResultPoints:
 
 
 def _values(reached: Reached) -> Points:
-    return tuple(Point(time, y[0], d) for time, y, d in reached)
+    return tuple([Point(time, y[0], d) for time, y, d in reached])
 
 
 def count_accepted(statistics: Statistics, step_size: float, reached: Reached) -> None:

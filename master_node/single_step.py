@@ -8,7 +8,7 @@ from master_node.discrete_step_requests import step_requests
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials
 from master_node.outputs import Outputs
 from master_node.run_context import RunContext
-from master_node.step_requests import FailedStep, Piece
+from master_node.step_requests import FailedStep, Piece, StepForm
 from protocol.calls import DoStep
 from protocol.errors import DoublestepError, SlaveError
 from protocol.signals import FloatArray
@@ -26,6 +26,7 @@ class SingleStepper:
         self._scheme = context.scheme
         self._coupled = context.coupled
         self._requests = step_requests(context.group, context.coupled, context.scheme)
+        self._request = self._requests.forms(StepForm((), context.scheme.get_outputs))
 
     def take(
         self,
@@ -51,12 +52,11 @@ class SingleStepper:
             BrokenOffError: a slave did not get to the end, or an output there is not finite.
             DoublestepError: a slave is lost or failed.
         """
-        scheme = self._scheme
         inputs = partial(self._inputs, history, polynomials, end)
         external = self._coupled.external.over(step.communication_point, end)
         held = self._coupled.discrete.held(begin.y[0], begin.d, step.communication_point)
-        piece = Piece((), inputs, external, held, step, scheme.get_outputs, scheme.output_rows)
-        (outputs,) = self._requests.take([piece])
+        piece = Piece(inputs, external, held, step)
+        (outputs,) = self._requests.take(self._request, (piece,))
         return outputs
 
     def _inputs(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 
 from master_node.observers import Exchange, ExchangeListener, SlaveStatistics, Statistics
 from master_node.slave_link import SlaveLink
-from protocol.calls import Call, DoStep, Reply, SetState
+from protocol.calls import Call, DoStep, Reply
 from protocol.errors import DoublestepError
 
 Program = tuple[Call, ...]
@@ -155,12 +155,8 @@ class SlaveGroup:
                 raise reply.error
         return replies
 
-    def count(self, index: int, executed: Iterable[Call]) -> None:
-        """Add the do_steps and rollbacks of what slave ``index`` executed to its statistics."""
+    def count(self, index: int, do_steps: int, rollbacks: int) -> None:
+        """Add what slave ``index`` executed to its statistics."""
         statistics = self._statistics[index]
-        for call in executed:
-            kind = type(call)
-            if kind is DoStep:
-                statistics.do_steps += 1
-            elif kind is SetState:
-                statistics.rollbacks += 1
+        statistics.do_steps += do_steps
+        statistics.rollbacks += rollbacks

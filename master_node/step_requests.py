@@ -6,7 +6,7 @@ time; the groups of a Gauss-Seidel sequence follow each other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from master_node.output_evaluation import OutputEvaluation
 from master_node.outputs import Outputs
 from master_node.restorable_slave import BrokenStepError
 from master_node.slave_group import Program, SlaveGroup
-from master_node.system import CoupledSystem
+from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import (
     Call,
     DoStep,
@@ -35,6 +35,7 @@ from protocol.errors import DoublestepError, StepRejectedError
 from protocol.signals import FloatArray
 from protocol.slave import StepStatus
 
+_NAN = float("nan")
 _AT_POINT = 0
 _HALFWAY = 1
 SAVE_POINT = GetState(_AT_POINT)
@@ -64,7 +65,7 @@ class FailedStep:
     reason: str
     error: DoublestepError | None = None
     step: DoStep | None = None
-    time: float = float("nan")
+    time: float = _NAN
 
     @property
     def has_crashed(self) -> bool:
@@ -82,26 +83,49 @@ Inputs = Callable[[FloatArray], FloatArray]
 as far as they are known by then, shape (rows, m)."""
 
 
-class Piece(NamedTuple):
-    """One step of all slaves: what comes first, which inputs, which step, which outputs.
+class StepForm(NamedTuple):
+    """What is the same in all steps of one kind.
 
     Attributes:
         before: what each slave does first: save or restore; None: what the last attempt calls for.
+        get_outputs: what each slave is asked for at the end.
+    """
+
+    before: tuple[Call, ...] | None
+    get_outputs: Sequence[GetOutputs]
+
+
+class RequestForm(NamedTuple):
+    """What is the same in all requests of one kind.
+
+    Attributes:
+        steps: that it holds, one or two.
+        places: for each slave where the outputs of each step are in its reply.
+        outputs: slave and place of all of them, step by step, where all slaves take the request at
+            once and are asked for as many rows each time; else empty.
+        rollbacks: how many there are, besides that to T_n.
+    """
+
+    steps: tuple[StepForm, ...]
+    places: Sequence[Sequence[int]]
+    outputs: tuple[tuple[int, int], ...]
+    rollbacks: int
+
+
+class Piece(NamedTuple):
+    """One step of all slaves: which inputs, which step.
+
+    Attributes:
         inputs: see `Inputs`.
         external: the external inputs in it.
         held: the discrete inputs in it.
         step: the same for all slaves.
-        get_outputs: for each slave.
-        rows: of its output arrays.
     """
 
-    before: tuple[Call, ...] | None
     inputs: Inputs
     external: ExternalSignal
     held: Held
     step: DoStep
-    get_outputs: Sequence[GetOutputs]
-    rows: int
 
 
 class BrokenOffError(Exception):
@@ -124,9 +148,14 @@ class StepRequests:
     def __init__(self, group: SlaveGroup, coupled: CoupledSystem, scheme: CouplingScheme) -> None:
         self._group = group
         self._names = coupled.output_names
-        self._columns = [part.columns for part in coupled.parts]
+        self._columns = [
+            _columns(part, rows)
+            for part, rows in zip(coupled.parts, scheme.input_rows, strict=True)
+        ]
         self._output_slices = [part.output_slice for part in coupled.parts]
         self._scheme = scheme
+        self._slaves = range(len(coupled.parts))
+        self._unknown = np.zeros((scheme.output_rows, len(self._names)))
         self._evaluation = OutputEvaluation(group, coupled, scheme)
         self.forget()
 
@@ -134,8 +163,31 @@ class StepRequests:
         """The state saved at T_n is not needed any more: it is saved anew where a step begins."""
         self._saved = [False] * len(self._columns)
 
-    def take(self, pieces: Sequence[Piece]) -> list[Outputs]:
+    def forms(self, *steps: StepForm) -> list[RequestForm]:
+        """The requests that take these steps: one, unless outputs are evaluated in between."""
+        if self._evaluation.is_needed:
+            return [self._form((step,)) for step in steps]
+        return [self._form(steps)]
+
+    def _form(self, steps: tuple[StepForm, ...]) -> RequestForm:
+        places = self._places(steps)
+        rows = {get.order + 1 for step in steps for get in step.get_outputs}
+        is_even = self._scheme.groups == (tuple(self._slaves),) and rows == {len(self._unknown)}
+        outputs = [
+            (slave, places[slave][number])
+            for number in range(len(steps) if is_even else 0)
+            for slave in self._slaves
+        ]
+        return RequestForm(
+            steps, places, tuple(outputs), sum(_rollbacks(step.before or ()) for step in steps)
+        )
+
+    def take(self, forms: Sequence[RequestForm], pieces: Sequence[Piece]) -> list[Outputs]:
         """Take steps from where the slaves stand.
+
+        Args:
+            forms: see `forms`.
+            pieces: the steps.
 
         Returns:
             The outputs at the end of each piece, those of continuous variables of shape (rows, m).
@@ -143,115 +195,164 @@ class StepRequests:
         Raises:
             BrokenOffError: a slave did not get to the end, or an output there is not finite.
         """
-        outputs = [np.zeros((piece.rows, len(self._names))) for piece in pieces]
         if not self._evaluation.is_needed:
-            discrete = self._request(pieces, outputs)
-            return list(map(Outputs, outputs, discrete))
-        discrete = []
-        for piece, y in zip(pieces, outputs, strict=True):
-            discrete += self._request([piece], [y])
+            return self._request(forms[0], pieces)
+        found = []
+        for form, piece in zip(forms, pieces, strict=True):
+            (outputs,) = self._request(form, [piece])
             step = piece.step
             try:
                 self._evaluation.evaluate(
-                    y, piece.external.end, step.communication_point, step.step_size
+                    outputs.y, piece.external.end, step.communication_point, step.step_size
                 )
             except StepRejectedError as error:
-                failed = FailedStep("", None, float("nan"), error.cause, error)
+                failed = FailedStep("", None, _NAN, error.cause, error)
                 raise BrokenOffError(failed) from None
-        return list(map(Outputs, outputs, discrete))
+            self._check_values(outputs.y)
+            found.append(outputs)
+        return found
 
-    def _request(
-        self, pieces: Sequence[Piece], outputs: Sequence[FloatArray]
-    ) -> list[DiscreteValues]:
-        """One request to each slave, group after group; fills ``outputs`` of each piece.
-
-        Returns:
-            The discrete outputs of each piece.
-        """
-        places = self._places(pieces)
-        answers: dict[int, list[object]] = {}
+    def _request(self, form: RequestForm, pieces: Sequence[Piece]) -> list[Outputs]:
+        """One request to each slave, group after group."""
+        if form.outputs:
+            return self._request_at_once(form, pieces)
+        places = form.places
+        values = np.zeros((len(pieces), *self._unknown.shape))
+        answers: list[list[Any] | None] = [None] * len(self._slaves)
         for slaves in self._scheme.groups:
-            inputs = [piece.inputs(y) for piece, y in zip(pieces, outputs, strict=True)]
-            programs = [self._program(slave, pieces, inputs) for slave in slaves]
-            replies = self._group.execute(
-                programs, pieces[0].step.communication_point, pieces[-1].step.step_size, slaves
-            )
-            self._check(slaves, programs, replies)
-            for slave, reply in zip(slaves, replies, strict=True):
-                columns = self._output_slices[slave]
-                answers[slave] = results = reply.results
-                for y, place in zip(outputs, places[slave], strict=True):
-                    values: Any = results[place]
-                    y[: len(values), columns] = values
-            for y in outputs:
-                bad = first_not_finite(y)
-                if bad is not None:  # before anyone else gets it
-                    reason = f"{self._names[bad]} is not finite"
-                    raise BrokenOffError(FailedStep("", None, float("nan"), reason))
-        return self._discrete_outputs(answers, places)
+            inputs = [piece.inputs(y) for piece, y in zip(pieces, values, strict=True)]
+            for slave, results in zip(
+                slaves, self._results(form, pieces, inputs, slaves), strict=True
+            ):
+                answers[slave], columns = results, self._output_slices[slave]
+                for y, place in zip(values, places[slave], strict=True):
+                    y[: len(results[place]), columns] = results[place]
+            self._check_values(values)  # before anyone else gets them
+        return list(map(Outputs, values, self._discrete_outputs(answers, places)))
 
-    def _places(self, pieces: Sequence[Piece]) -> Sequence[Sequence[int]]:
-        """For each slave where the outputs of each piece are in its reply."""
+    def _request_at_once(self, form: RequestForm, pieces: Sequence[Piece]) -> list[Outputs]:
+        """The same for all slaves at a time, all answers being of one shape."""
+        inputs = [piece.inputs(self._unknown) for piece in pieces]
+        answers = self._results(form, pieces, inputs, self._slaves)
+        values = np.concatenate([answers[slave][place] for slave, place in form.outputs], axis=1)
+        self._check_values(values)
+        discrete = self._discrete_outputs(answers, form.places)
+        if len(pieces) == 1:
+            return [Outputs(values, discrete[0])]
+        first, second = discrete
+        width = len(self._names)
+        return [Outputs(values[:, :width], first), Outputs(values[:, width:], second)]
+
+    def _check_values(self, values: FloatArray) -> None:
+        bad = first_not_finite(values)
+        if bad is not None:
+            reason = f"{self._names[bad % len(self._names)]} is not finite"
+            raise BrokenOffError(FailedStep("", None, _NAN, reason))
+
+    def _places(self, steps: Sequence[StepForm]) -> Sequence[Sequence[int]]:
+        """For each slave where the outputs of each step are in its reply."""
         places = []
         length = 0
-        for piece in pieces:
-            length += (1 if piece.before is None else len(piece.before)) + 3
+        for step in steps:
+            length += (1 if step.before is None else len(step.before)) + 3
             places.append(length - 1)
         return [places] * len(self._columns)
 
     def _discrete_outputs(
         self,
-        answers: Mapping[int, list[object]],  # noqa: ARG002  all is continuous
+        answers: Sequence[list[Any] | None],  # noqa: ARG002  all is continuous
         places: Sequence[Sequence[int]],
     ) -> list[DiscreteValues]:
-        """Those of each piece, from the results of each slave that was asked."""
+        """Those of each piece, from the results of each slave, None if it was not asked."""
         return [()] * len(places[0])
 
     def _program(
-        self, slave: int, pieces: Sequence[Piece], inputs: Sequence[FloatArray]
+        self, slave: int, form: RequestForm, pieces: Sequence[Piece], inputs: Sequence[FloatArray]
     ) -> Program:
-        rows, columns = self._scheme.input_rows[slave], self._columns[slave]
+        columns = self._columns[slave]
         calls: list[Call] = []
-        for piece, derivatives in zip(pieces, inputs, strict=True):
-            if piece.before is None:
+        for (before, get_outputs), piece, derivatives in zip(
+            form.steps, pieces, inputs, strict=True
+        ):
+            if before is None:
                 calls.append(RESTORE_POINT if self._saved[slave] else SAVE_POINT)
             else:
-                calls.extend(piece.before)
+                calls += before
             calls += (
-                SetInputs(columns(derivatives[:rows], piece.external.rows)),
+                SetInputs(columns(derivatives, piece.external.rows)),
                 piece.step,
-                piece.get_outputs[slave],
+                get_outputs[slave],
             )
         return tuple(calls)
 
-    def _check(
-        self, slaves: Sequence[int], programs: Sequence[Program], replies: Sequence[Reply]
-    ) -> None:
-        """Count what was executed.
+    def _results(
+        self,
+        form: RequestForm,
+        pieces: Sequence[Piece],
+        inputs: Sequence[FloatArray],
+        slaves: Sequence[int],
+    ) -> list[list[Any]]:
+        """Of the programs of these slaves; counts what was executed.
 
         Raises:
             BrokenOffError: a slave did not get to the end.
             DoublestepError: its error is one that a smaller step cannot help.
         """
+        programs = [self._program(slave, form, pieces, inputs) for slave in slaves]
+        replies = self._group.execute(
+            programs, pieces[0].step.communication_point, pieces[-1].step.step_size, slaves
+        )
+        do_steps, saved = len(pieces), self._saved
+        begins_anew = form.steps[0].before is None
         failures = []
         for slave, program, reply in zip(slaves, programs, replies, strict=True):
+            if len(reply.results) < len(program):
+                failures.append((slave, program, reply))
+                continue
+            rollbacks = form.rollbacks
+            if begins_anew:
+                rollbacks += saved[slave]
+                saved[slave] = True
+            self._group.count(slave, do_steps, rollbacks)
+        if failures:
+            raise self._broken_off(failures)
+        return [reply.results for reply in replies]
+
+    def _broken_off(self, incomplete: Sequence[tuple[int, Program, Reply]]) -> BrokenOffError:
+        """For slaves that did not get to the end of their programs; errors as of `_results`."""
+        failures = []
+        error: DoublestepError | None = None
+        for slave, program, reply in incomplete:
             done = program[: len(reply.results)]
-            self._group.count(slave, done)
+            steps = sum(type(call) is DoStep for call in done)
+            self._group.count(slave, steps, _rollbacks(done))
             if done and done[0] is SAVE_POINT:
                 self._saved[slave] = True
-            if len(done) == len(program):
-                continue
             if reply.error is not None and not isinstance(reply.error, StepRejectedError):
-                raise reply.error
-            failures.append(_failure(self._group.names[slave], program, reply))
-        if failures:
-            terminated = [f for f in failures if f.status is StepStatus.TERMINATED]
-            raise BrokenOffError((terminated or failures)[0])
+                error = error or reply.error
+            else:
+                failures.append(_failure(self._group.names[slave], program, reply))
+        if error is not None:
+            raise error
+        terminated = [f for f in failures if f.status is StepStatus.TERMINATED]
+        return BrokenOffError((terminated or failures)[0])
+
+
+def _rollbacks(calls: Sequence[Call]) -> int:
+    return sum(type(call) is SetState for call in calls)
+
+
+def _columns(part: SlavePart, rows: int) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """What a slave that takes ``rows`` of derivatives gets of the inputs of the system."""
+    if part.external_rows:
+        return lambda connected, external: part.columns(connected[:rows], external)
+    own = slice(rows), part.input_slice
+    return lambda connected, _: connected[own]
 
 
 def _failure(slave: str, program: Program, reply: Reply) -> FailedStep:
     if reply.error is not None:
-        return FailedStep(slave, None, float("nan"), f"{slave}: {reply.error.cause}", reply.error)
+        return FailedStep(slave, None, _NAN, f"{slave}: {reply.error.cause}", reply.error)
     call, result = program[len(reply.results) - 1], reply.results[-1]
     assert isinstance(call, DoStep)
     assert isinstance(result, StepResult)

@@ -186,10 +186,10 @@ class CoupledSystem:
             u[0 if u.ndim > 1 else ...] += self.offset
         return u
 
-    def weights_of_inputs(self, weights: FloatArray) -> FloatArray:
-        """Weights for inputs, shape (n,), from those for outputs, shape (m,)."""
-        taken: FloatArray = weights.take(self.source)
-        return taken / np.abs(self.factor) if self._transforms else taken
+    def scale_of_inputs(self, scale: FloatArray) -> FloatArray:
+        """Tolerances of inputs, shape (n,), unit [u], from those of outputs, (m,), unit [y]."""
+        taken: FloatArray = scale.take(self.source)
+        return taken * np.abs(self.factor) if self._transforms else taken
 
 
 def resolve(

@@ -44,7 +44,8 @@ class InputSignal:
             return self
         rows = d.copy()
         if k == 1:
-            rows[0] += d[1] * offset
+            value, slope = rows
+            value += slope * offset
             return InputSignal(rows)
         for j in range(k):
             value = d[k]

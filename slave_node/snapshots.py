@@ -16,6 +16,7 @@ class SnapshotStore:
 
     def __init__(self, slave: Slave, limit: int = LIMIT) -> None:
         self._slave = slave
+        self._get_state, self._free_state = slave.get_state, slave.free_state
         self._limit = limit
         self._states: dict[int, object] = {}
 
@@ -28,7 +29,7 @@ class SnapshotStore:
         Raises:
             SlaveError: the store is full, or the slave cannot.
         """
-        self._put(number, self._slave.get_state)
+        self._put(number, self._get_state)
 
     def restore(self, number: int, *, free: bool = False) -> None:
         """Let the slave go back to the state; it stays saved unless ``free``."""
@@ -71,7 +72,7 @@ class SnapshotStore:
         if number in states:
             old = states[number]
             states[number] = make()
-            self._slave.free_state(old)
+            self._free_state(old)
         elif len(states) < self._limit:
             states[number] = make()
         else:

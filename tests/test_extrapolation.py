@@ -57,7 +57,7 @@ def signal_of(
     offsets: Sequence[float], values: Sequence[np.ndarray], slopes: Sequence[np.ndarray] = ()
 ) -> InputSignal:
     """What goes over the wire for some points."""
-    return InputSignal(np.array(interpolate(offsets, values, slopes)))
+    return InputSignal(interpolate(offsets, values, slopes))
 
 
 def through(

@@ -134,7 +134,7 @@ def test_magnitudes_are_those_of_the_derivatives(
             tuple(times), tuple(np.array([[f(t)] for f in rows]) for t in times), 5
         )
         found = input_magnitudes(
-            history, np.array([slopes]), np.array([2.0]), np.zeros(1, dtype=np.intp), 1
+            history, np.array([slopes]), np.array([0.5]), np.zeros(1, dtype=np.intp), 1
         )
         assert found.shape == (5, 1)
         assert found[degree, 0] == pytest.approx(2.0 * abs(coefficients[degree]), abs=1e-7)

@@ -374,7 +374,7 @@ def test_units_are_converted() -> None:
     y = np.array([[1500.0, 20.0, 0.0], [4.0, 5.0, 0.0]])
     assert coupled.inputs_of(y[0]).tolist() == [1.5, 293.15]
     assert coupled.inputs_of(y).tolist() == [[1.5, 293.15], [0.004, 5.0]]
-    assert coupled.weights_of_inputs(np.array([1.0, 1.0, 1.0])).tolist() == [1000.0, 1.0]
+    assert coupled.scale_of_inputs(np.array([1.0, 1.0, 1.0])).tolist() == [0.001, 1.0]
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from master_node.numerics.double_step_times import DoubleStepTimes
 from protocol.signals import FloatArray
 
@@ -36,13 +38,15 @@ class Defects(NamedTuple):
         expected: ``end`` as ``middle`` and the step before let expect it, were everything smooth.
         change: weighted change that the polynomial said for the input with the largest defect.
         input_number: index of that input.
+
+    The last three say something only where one of the first two is above 1: else nothing jumps.
     """
 
     middle: float
     end: float
-    expected: float
-    change: float
-    input_number: int
+    expected: float = 0.0
+    change: float = 0.0
+    input_number: int = -1
 
     @property
     def largest(self) -> float:
@@ -93,13 +97,19 @@ class Bracket(NamedTuple):
         return self._replace(rejected=None)
 
 
-def measure(defect: FloatArray, weights: FloatArray) -> tuple[float, int]:
-    """The largest weighted defect and its input; 0 and -1 without inputs. Shapes (n,)."""
-    if not defect.size:
+def measure(defect: FloatArray, scale: FloatArray) -> tuple[float, int]:
+    """The largest defect over its tolerance, and its input; 0 and -1 without inputs.
+
+    Args:
+        defect: shape (n,), unit [u]; overwritten.
+        scale: the tolerances, shape (n,), unit [u].
+    """
+    if not len(defect):
         return 0.0, -1
-    weighted = abs(defect) * weights
-    index = int(weighted.argmax())
-    return float(weighted[index]), index
+    np.abs(defect, out=defect)
+    defect /= scale
+    index = int(defect.argmax())
+    return float(defect[index]), index
 
 
 def has_jumped_unnoticed(defects: Defects) -> bool:

@@ -60,15 +60,14 @@ class ErrorEstimator:
         return (points + 1) // 2 if self.comparison is Comparison.LONG_STEP else points
 
     @staticmethod
-    def estimate(y: FloatArray, y_comparison: FloatArray, ratio: FloatArray | float) -> FloatArray:
+    def estimate(difference: FloatArray, ratio: FloatArray | float) -> FloatArray:
         """EST, shape (m,), unit [y]: (y - y_comparison) / (1 - p).
 
         Args:
-            y: of the two small steps, shape (m,).
-            y_comparison: the comparison solution, shape (m,).
+            difference: of the two small steps from the comparison solution, shape (m,), unit [y].
             ratio: p, one for all or one for each output, shape (m,).
         """
-        return (y - y_comparison) / (1.0 - ratio)
+        return difference / (1.0 - ratio)
 
 
 _GAUSS = sqrt(0.6)
@@ -85,9 +84,13 @@ def node_polynomial(nodes: Nodes, offset: float) -> float:
 def node_integral(nodes: Nodes, begin: float, end: float) -> float:
     """The integral of w from ``begin`` to ``end``, for at most five nodes.
 
-    Three Gauss points: exact up to rounding for polynomials of degree five.
+    Three Gauss points: exact up to rounding for polynomials of degree five. For two nodes, the
+    usual ones, what comes of them is 2 h (w(m) + h^2 / 3) with the middle m and the half h.
     """
     half, middle = 0.5 * (end - begin), 0.5 * (begin + end)
+    if len(nodes) == 2:
+        newest, older = nodes
+        return 2.0 * half * ((middle - newest) * (middle - older) + half * half / 3.0)
     outer = _GAUSS * half
     return (half / 9.0) * (
         5.0 * node_polynomial(nodes, middle - outer)

@@ -9,6 +9,7 @@ derivatives that are exactly zero and no input's polynomial depends on the other
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -131,6 +132,18 @@ Polynomials = tuple[InputPolynomial, ...]
 """One polynomial for each kind of input."""
 
 
+_LINES: Polynomials = (InputPolynomial(1),)
+
+
+@lru_cache
+def highest(polynomials: Polynomials) -> InputPolynomial:
+    """The highest degree among them, with the most derivative points."""
+    return InputPolynomial(
+        max(polynomial.order for polynomial in polynomials),
+        max(polynomial.derivative_points for polynomial in polynomials),
+    )
+
+
 class Extrapolation:
     """The input polynomials of a system, each input's by its kind.
 
@@ -143,9 +156,15 @@ class Extrapolation:
         self.kinds = tuple(kinds)
         self.kind_of_input = kind_of_input
         self._columns = [np.flatnonzero(kind_of_input == i) for i in range(len(self.kinds))]
+        # where the points of each kind begin, by the number of points that are known ahead
+        self._begins = [[0 if kind.ahead else ahead for kind in self.kinds] for ahead in (0, 1)]
+        self._polynomials = lru_cache(self._limited)
 
     def polynomials(self, polynomial: InputPolynomial, points: int) -> Polynomials:
         """What ``polynomial`` becomes for each kind, through ``points`` points at most."""
+        return self._polynomials(polynomial, points)
+
+    def _limited(self, polynomial: InputPolynomial, points: int) -> Polynomials:
         return tuple(
             polynomial.limited(
                 kind.max_order, polynomial.derivative_points * kind.has_derivative, points
@@ -160,13 +179,18 @@ class Extrapolation:
 
         Other arguments as for `signal`.
         """
+        return self.nodes_at(tuple([time - origin for time in times]), polynomials, known_ahead)
+
+    def nodes_at(
+        self, offsets: Nodes, polynomials: Polynomials, known_ahead: int = 0
+    ) -> list[Nodes]:
+        """The same through points at these offsets [s]."""
+        begins = self._begins[known_ahead]
+        if len(polynomials) == 1:
+            return [_nodes(offsets, begins[0], polynomials[0])]
         return [
-            tuple(
-                times[begin + i] - origin
-                for i in range(polynomial.points)
-                for _ in range(1 + (i < polynomial.derivative_points))
-            )
-            for begin, polynomial in zip(self._begins(known_ahead), polynomials, strict=True)
+            _nodes(offsets, begin, polynomial)
+            for begin, polynomial in zip(begins, polynomials, strict=True)
         ]
 
     def signal(
@@ -180,36 +204,90 @@ class Extrapolation:
             polynomials: of each kind.
             known_ahead: 0 or 1.
         """
-        times, inputs = history.times, history.inputs
-        now = times[known_ahead]
-        is_only_kind = len(self.kinds) == 1
-        parts = []
-        for columns, begin, (degree, slopes) in zip(
-            self._columns, self._begins(known_ahead), polynomials, strict=True
-        ):
-            points = range(begin, begin + degree + 1 - slopes)
-            values = [inputs[i][0] for i in points]
-            slope_values = [inputs[i][1] for i in points[:slopes]]
-            if not is_only_kind:
-                values = [row[columns] for row in values]
-                slope_values = [row[columns] for row in slope_values]
-            rows = interpolate([times[i] - now for i in points], values, slope_values)
-            parts.append(np.array(rows))
-        if is_only_kind:
-            return InputSignal(parts[0])
-        derivatives = np.zeros((max(map(len, parts)), inputs[0].shape[1]))
+        begins = self._begins[known_ahead]
+        if len(polynomials) == 1:
+            return InputSignal(_rows(history, begins[0], polynomials[0], known_ahead))
+        parts = [
+            _rows(history, begin, polynomial, known_ahead, columns)
+            for columns, begin, polynomial in zip(self._columns, begins, polynomials, strict=True)
+        ]
+        derivatives = np.zeros((max(map(len, parts)), history.inputs[0].shape[1]))
         for columns, part in zip(self._columns, parts, strict=True):
             derivatives[: len(part), columns] = part
         return InputSignal(derivatives)
 
-    def _begins(self, known_ahead: int) -> list[int]:
-        """Where the points of each kind begin."""
-        return [0 if kind.ahead else known_ahead for kind in self.kinds]
+    def in_step(
+        self,
+        history: CouplingHistory,
+        polynomials: Polynomials,
+        step_size: float,
+        known_ahead: int = 0,
+    ) -> StepInputs:
+        """The same at both ends of a step of ``step_size`` [s]; other arguments as for `signal`."""
+        if polynomials == _LINES and self._begins[known_ahead][0] == known_ahead:  # the usual ones
+            times, inputs = history.times, history.inputs
+            now, before = known_ahead, known_ahead + 1
+            return _line(inputs[now][0], inputs[before][0], times[now] - times[before], step_size)
+        signal = self.signal(history, polynomials, known_ahead)
+        return StepInputs(signal.derivatives, signal.shifted(step_size).derivatives)
+
+
+class StepInputs(NamedTuple):
+    """Input polynomials at both ends of a step, shape (k + 1, n) each."""
+
+    begin: FloatArray
+    end: FloatArray
+
+
+def _line(newest: FloatArray, older: FloatArray, span: float, step_size: float) -> StepInputs:
+    """Straight lines through two points ``span`` [s] apart, in a step from the newest one."""
+    slope = newest - older
+    slope /= span
+    end = slope * step_size
+    end += newest
+    return StepInputs(np.array((newest, slope)), np.array((end, slope)))
+
+
+def _nodes(offsets: Nodes, begin: int, polynomial: InputPolynomial) -> Nodes:
+    """The nodes of one polynomial whose points begin at ``offsets[begin]``."""
+    order, slopes = polynomial
+    nodes = offsets[begin : begin + order + 1 - slopes]
+    if slopes:
+        return (*[node for node in nodes[:slopes] for _ in (0, 1)], *nodes[slopes:])
+    return nodes
+
+
+def _rows(
+    history: CouplingHistory,
+    begin: int,
+    polynomial: InputPolynomial,
+    now: int,
+    columns: NDArray[np.intp] | None = None,
+) -> FloatArray:
+    """Derivatives of one polynomial at ``history.times[now]``, shape (k + 1, n).
+
+    Args:
+        history: to go through, from point number ``begin`` on.
+        begin: see above.
+        polynomial: of these inputs.
+        now: number of the point.
+        columns: of the inputs; None: all.
+    """
+    order, slopes = polynomial
+    times, inputs = history.times, history.inputs
+    end = begin + order + 1 - slopes
+    values = [rows[0] for rows in inputs[begin:end]]
+    slope_values = [rows[1] for rows in inputs[begin : begin + slopes]]
+    if columns is not None:
+        values = [row[columns] for row in values]
+        slope_values = [row[columns] for row in slope_values]
+    origin = times[now]
+    return interpolate([time - origin for time in times[begin:end]], values, slope_values)
 
 
 def interpolate(
     offsets: Sequence[float], values: Sequence[FloatArray], slopes: Sequence[FloatArray] = ()
-) -> list[FloatArray]:
+) -> FloatArray:
     """The polynomial through some points, with the derivatives at the first of them.
 
     Newton's confluent divided differences, then Horner's scheme to powers of the offset.
@@ -220,12 +298,9 @@ def interpolate(
         slopes: derivatives at the first points, shape (n,) each, unit [u]/s.
 
     Returns:
-        Derivatives of order 0 to k at offset 0, shape (n,) each; k + 1 is the number of values
+        Derivatives of order 0 to k at offset 0, shape (k + 1, n); k + 1 is the number of values
         and slopes. At an offset 0 the value is met bit for bit.
     """
-    if len(values) + len(slopes) <= 2 and not offsets[0]:  # degree 0 or 1, the usual short way
-        rest = slopes or [(values[0] - older) / -offsets[1] for older in values[1:]]
-        return [values[0], *rest]
     nodes: list[float] = []
     level: list[FloatArray] = []
     for i, (offset, value) in enumerate(zip(offsets, values, strict=True)):
@@ -243,9 +318,10 @@ def interpolate(
                 powers[j] = powers[j] - node * powers[j + 1]
     if 0.0 in offsets:
         powers[0] = values[offsets.index(0.0)]
-    for j in range(2, k + 1):
-        powers[j] = _FACTORIALS[j] * powers[j]
-    return powers
+    rows = np.empty((k + 1, len(values[0])))
+    for j, power in enumerate(powers):
+        np.multiply(_FACTORIALS[j], power, out=rows[j])
+    return rows
 
 
 _FACTORIALS = (1.0, 1.0, 2.0, 6.0)

@@ -38,6 +38,8 @@ class LandingPoints:
             first: whether to end on the first point in reach, in place of the last.
         """
         times = self._times
+        if not times:
+            return target
         low = bisect_left(times, begin + self._nearest)
         high = bisect_right(times, target - self._nearest)
         reached = bisect_right(times, begin + 2.0 * step_size * _ROUNDING, low, max(low, high))

@@ -132,7 +132,7 @@ def beginning(polynomials: Sequence[InputPolynomial]) -> InputPolynomial:
 def input_magnitudes(
     history: CouplingHistory,
     has_derivative: NDArray[np.bool_],
-    weights: FloatArray,
+    scale: FloatArray,
     group_of_input: NDArray[np.intp],
     groups: int,
 ) -> FloatArray:
@@ -144,7 +144,7 @@ def input_magnitudes(
     Args:
         history: newest points; as many levels as there are conditions, `DEPTH` at most.
         has_derivative: which inputs have one in the history, shape (n,).
-        weights: of the inputs, shape (n,), unit 1/[u].
+        scale: tolerances of the inputs, shape (n,), unit [u].
         group_of_input: index of the group that an input acts on, shape (n,).
         groups: how many groups there are.
 
@@ -161,7 +161,7 @@ def input_magnitudes(
         table[:common] = np.where(smaller, hermite[:common], table[:common])
         if has_derivative.all():
             table = np.concatenate((table, hermite[common:]))
-    squares = np.square(table * weights)
+    squares = np.square(table / scale)
     norms: FloatArray = np.sqrt([np.bincount(group_of_input, row, groups) for row in squares])
     return norms
 

@@ -83,21 +83,22 @@ class StepSizeController:
             exponent: P = k + 1 if a slave has direct feed-through, else k + 2.
             memory: from the last decision.
         """
-        accepted = error_norm <= 1.0
-        factor = self.elementary_factor(error_norm, exponent)
-        if accepted:
-            if error_norm > 0.0 and memory.error_norm > 0.0:
-                factor = power(self.alpha, self.present + self.past) * (
-                    power(error_norm, -self.present / exponent)
-                    * power(memory.error_norm, -self.past / exponent)
-                )
-            if memory.rejected and not self.grows_after_rejection:
-                factor = min(factor, 1.0)
+        before = memory.error_norm
+        if not error_norm <= 1.0:
+            factor = self.elementary_factor(error_norm, exponent)
+            following = ControllerMemory(before, rejected=True)
+            return StepDecision(False, self.bounded(step_size * factor), following)
+        if error_norm > 0.0 and before > 0.0:
+            factor = power(self.alpha, self.present + self.past) * (
+                power(error_norm, -self.present / exponent) * power(before, -self.past / exponent)
+            )
             factor = min(self.theta_max, max(self.theta_min, factor))
-            following = ControllerMemory(error_norm)
         else:
-            following = ControllerMemory(memory.error_norm, rejected=True)
-        return StepDecision(accepted, self.bounded(step_size * factor), following)
+            factor = self.elementary_factor(error_norm, exponent)
+        if memory.rejected and not self.grows_after_rejection:
+            factor = min(factor, 1.0)
+        following = ControllerMemory(error_norm)
+        return StepDecision(True, self.bounded(step_size * factor), following)
 
     def elementary_factor(self, error_norm: float, exponent: int) -> float:
         """H_opt / H of the elementary controller."""

@@ -1,7 +1,7 @@
 """Values and derivatives of some real variables of an FMU, exchanged without allocation.
 
-The buffer and the addresses in it are made once; a transfer is one call of a C function with all
-its arguments bound.
+The buffer and the addresses in it are made once; a transfer is one call of a C function whose
+arguments are all converted beforehand.
 """
 
 from __future__ import annotations
@@ -20,6 +20,10 @@ from slave_node.fmu.variables import Place
 
 VALUES_CALL = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p]
 """Argument types of fmi2GetReal and fmi2SetReal, without the component."""
+
+Bind = Callable[..., Callable[[], int]]
+"""Of a full name, argument types and arguments the call of that function, see
+`FmuInstance.bound`."""
 
 DERIVATIVES_CALL = [*VALUES_CALL, ctypes.c_void_p]
 """Argument types of fmi2SetRealInputDerivatives and fmi2GetRealOutputDerivatives."""
@@ -65,9 +69,10 @@ class ExchangeBuffer(Buffer):
 
     Args:
         references: value references, shape (n,).
-        values: name of and fmi2GetReal or fmi2SetReal with ``VALUES_CALL``, component bound.
-        derivatives: the same of fmi2SetRealInputDerivatives or fmi2GetRealOutputDerivatives with
-            ``DERIVATIVES_CALL``; None: nothing is transferred.
+        bind: binds the arguments of a function.
+        values: name of fmi2GetReal or fmi2SetReal.
+        derivatives: name of fmi2SetRealInputDerivatives or fmi2GetRealOutputDerivatives; "":
+            nothing is transferred.
     """
 
     __slots__ = ("_orders", "_references")
@@ -75,22 +80,23 @@ class ExchangeBuffer(Buffer):
     def __init__(
         self,
         references: NDArray[np.uint32],
-        values: tuple[str, Any],
-        derivatives: tuple[str, Any] | None,
+        bind: Bind,
+        values: str,
+        derivatives: str = "",
     ) -> None:
         n = len(references)
         super().__init__(n)
         self._references = np.tile(references, MAX_ORDER)
         self._orders = np.repeat(np.arange(1, MAX_ORDER + 1, dtype=np.int32), n)
         of, address = self._references.ctypes.data, self.rows.ctypes.data
-        self.values_function, get_or_set = values
-        self.transfer_values = partial(get_or_set, of, n, address)
-        if derivatives is None:
+        self.values_function = values
+        self.transfer_values = bind(values, VALUES_CALL, of, n, address)
+        if not derivatives:
             return
-        self.derivatives_function, get_or_set_derivatives = derivatives
+        self.derivatives_function = derivatives
         order_numbers, row_1 = self._orders.ctypes.data, address + n * self.rows.itemsize
         self.transfer_derivatives = [
-            partial(get_or_set_derivatives, of, k * n, order_numbers, row_1)
+            bind(derivatives, DERIVATIVES_CALL, of, k * n, order_numbers, row_1)
             for k in range(MAX_ORDER + 1)
         ]
 
@@ -140,10 +146,11 @@ class _WholeVariables:
         self.columns = np.array(columns)
         self.elements = np.array([begins[place.reference] + place.element for place in places])
 
-    def call(self, function: Any) -> Callable[[], int]:
+    def call(self, bind: Bind, function: str) -> Callable[[], int]:
         """A call of fmi3GetFloat64 or its like for them."""
-        return partial(
+        return bind(
             function,
+            VALUES_CALL_3,
             self.references.ctypes.data,
             len(self.references),
             self.values.ctypes.data,
@@ -159,7 +166,7 @@ class ArrayExchangeBuffer(Buffer):
 
     Args:
         places: of the scalar variables.
-        function: gives the function of a full name and argument types, with the component bound.
+        bind: binds the arguments of a function.
         sets: whether the FMU is to take the values (inputs) or to give them (outputs).
         derivatives: whether outputs have them.
     """
@@ -169,7 +176,7 @@ class ArrayExchangeBuffer(Buffer):
     def __init__(
         self,
         places: Sequence[Place],
-        function: Callable[[str, Sequence[Any]], Any],
+        bind: Bind,
         *,
         sets: bool,
         derivatives: bool,
@@ -185,8 +192,9 @@ class ArrayExchangeBuffer(Buffer):
         if is_plain:
             references = np.array([place.reference for place in places], dtype=np.uint32)
             self._kept.append(references)
-            self.transfer_values = partial(
-                function(self.values_function, VALUES_CALL_3),
+            self.transfer_values = bind(
+                self.values_function,
+                VALUES_CALL_3,
                 references.ctypes.data,
                 n,
                 self.rows.ctypes.data,
@@ -197,13 +205,12 @@ class ArrayExchangeBuffer(Buffer):
                 columns = [i for i, place in enumerate(places) if place.type is kind]
                 if columns:
                     whole = _WholeVariables(dtype, [places[i] for i in columns], columns)
-                    get = function(f"fmi3Get{kind}", VALUES_CALL_3)
-                    transfer = function(f"{verb}{kind}", VALUES_CALL_3)
-                    self._wholes.append((whole, whole.call(get), whole.call(transfer)))
+                    get = whole.call(bind, f"fmi3Get{kind}")
+                    transfer = whole.call(bind, f"{verb}{kind}")
+                    self._wholes.append((whole, get, transfer))
             self.transfer_values = self._set if sets else self._get
         if derivatives:
-            get_derivatives = function(self.derivatives_function, DERIVATIVES_CALL_3)
-            self.transfer_derivatives = self._derivatives(places, get_derivatives)
+            self.transfer_derivatives = self._derivatives(places, bind)
 
     def fill(self) -> int:
         """Get the elements of arrays that are no columns, for `transfer_values` to set again."""
@@ -224,7 +231,7 @@ class ArrayExchangeBuffer(Buffer):
             worst = max(worst, transfer())
         return worst
 
-    def _derivatives(self, places: Sequence[Place], function: Any) -> Sequence[Callable[[], int]]:
+    def _derivatives(self, places: Sequence[Place], bind: Bind) -> Sequence[Callable[[], int]]:
         """All orders in one call; the values are of type Float64 whatever the variables are."""
         whole = _WholeVariables(np.float64, places, range(len(places)))
         n, size = len(whole.references), len(whole.values)
@@ -233,8 +240,9 @@ class ArrayExchangeBuffer(Buffer):
         values = np.zeros((MAX_ORDER, size))
         self._kept += [references, orders, values]
         calls = [
-            partial(
-                function,
+            bind(
+                self.derivatives_function,
+                DERIVATIVES_CALL_3,
                 references.ctypes.data,
                 k * n,
                 orders.ctypes.data,

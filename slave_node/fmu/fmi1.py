@@ -26,7 +26,7 @@ from protocol.errors import StepRejectedError
 from protocol.signals import FloatArray
 from protocol.slave import StartValue, StepStatus, VariableType
 from slave_node.fmu.description import FmuModel
-from slave_node.fmu.exchange import DERIVATIVES_CALL, VALUES_CALL, ExchangeBuffer
+from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer
 from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, reference_array
 from slave_node.fmu.log import LOGGER_1, add_proxy, instantiating, register, unregister
@@ -114,11 +114,8 @@ class Fmi1Slave(FmuSlave):
         places = instance.model.places
 
         def buffer(names: Sequence[str], values: str, derivatives: str) -> ExchangeBuffer:
-            return ExchangeBuffer(
-                reference_array(instance.continuous_places(names)),
-                (values, instance.function(values, VALUES_CALL)),
-                (derivatives, instance.function(derivatives, DERIVATIVES_CALL)),
-            )
+            references = reference_array(instance.continuous_places(names))
+            return ExchangeBuffer(references, instance.bound, values, derivatives)
 
         def signs(names: Sequence[str]) -> FloatArray:
             return np.array([-1.0 if places[name].is_negated else 1.0 for name in names])

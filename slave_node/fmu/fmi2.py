@@ -19,7 +19,7 @@ from protocol.calls import StepResult
 from protocol.errors import StepRejectedError
 from protocol.slave import StartValue, StepStatus, VariableType
 from slave_node.fmu.description import FmuModel
-from slave_node.fmu.exchange import DERIVATIVES_CALL, VALUES_CALL, ExchangeBuffer
+from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer
 from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, reference_array
 from slave_node.fmu.log import LOGGER_2, add_proxy, register, unregister, wanted_categories
@@ -96,11 +96,8 @@ class Fmi2Instance(FmuInstance):
 
     def buffer(self, names: Sequence[str], values: str, derivatives: str = "") -> ExchangeBuffer:
         """For these variables, with the functions of these names."""
-        return ExchangeBuffer(
-            reference_array(self.continuous_places(names)),
-            (values, self.function(values, VALUES_CALL)),
-            (derivatives, self.function(derivatives, DERIVATIVES_CALL)) if derivatives else None,
-        )
+        references = reference_array(self.continuous_places(names))
+        return ExchangeBuffer(references, self.bound, values, derivatives)
 
     def close(self) -> None:
         """See `FmuInstance`."""

@@ -111,7 +111,7 @@ class Fmi3Instance(FmuInstance):
     ) -> ArrayExchangeBuffer:
         """For these variables, see `ArrayExchangeBuffer`."""
         places = self.continuous_places(names)
-        return ArrayExchangeBuffer(places, self.function, sets=sets, derivatives=derivatives)
+        return ArrayExchangeBuffer(places, self.bound, sets=sets, derivatives=derivatives)
 
     def update_discrete_states(self) -> tuple[bool, bool, bool]:
         """In event mode, fmi3UpdateDiscreteStates until there is nothing more to update.

@@ -168,10 +168,25 @@ class FmuInstance(ABC):
 
         ``argument_types``: of the arguments behind the component.
         """
-        function = self.fmu.dll[self.c_name(name)]
+        function = self._function(name)
         function.argtypes = [ADDRESS, *argument_types]
+        return partial(function, ADDRESS.from_param(self.component))
+
+    def bound(self, name: str, argument_types: Sequence[Any], *arguments: int) -> Callable[[], int]:
+        """The same with all its arguments bound, so that a call has nothing left to convert.
+
+        What the arguments are addresses of must outlive the call.
+        """
+        converted = [
+            kind.from_param(argument)
+            for kind, argument in zip(argument_types, arguments, strict=True)
+        ]
+        return partial(self._function(name), ADDRESS.from_param(self.component), *converted)
+
+    def _function(self, name: str) -> Any:
+        function = self.fmu.dll[self.c_name(name)]
         function.restype = ctypes.c_int
-        return partial(function, self.component)
+        return function
 
     def c_name(self, name: str) -> str:
         """The name in the binary."""
