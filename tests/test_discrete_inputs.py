@@ -19,6 +19,8 @@ from protocol.errors import ConfigurationError, SlaveError
 from protocol.slave import Causality, StartValue, StateKind, Variable, VariableType
 from tests.quarter_car_case import ALL, LinearSlave, LinearSystem, Run, run_slaves
 
+pytestmark = pytest.mark.timeout(300)  # the first one may pay for the build of the FMUs
+
 STOP = 2.0
 KINDS = ["mod", "rich", "none", "no rollback"]
 SLOPES = replace(ALL, max_output_derivative_order=1)
@@ -288,3 +290,19 @@ def test_what_is_legal_is_of_the_type(type_: VariableType, given_value: StartVal
     else:
         kinds = {VariableType.BOOLEAN: bool, VariableType.STRING: str, VariableType.BINARY: bytes}
         assert type(value) is kinds[type_]
+
+
+@pytest.mark.parametrize("kind", ["mod", "rich"])
+def test_changes_on_a_grid_are_told_at_its_next_point(kind: str) -> None:
+    """Steps are multiples of 0.04 s; 0.3 s is none, and the double step over it ends at 0.32 s."""
+    slave = Switched()
+    system = System(
+        simulation={"stop_time": STOP, "estimator": kind},
+        slaves={"slave": {"step_multiple": 0.04, "largest_step_size": 0.2}},
+        inputs={"slave.level": rows((0.0, 0.3), (1, 4))},
+    )
+    run = run_slaves(system, {"slave": slave})
+    assert run.error is None
+    exact = motion(run.result.time, (0.0, 0.32), (1, 4))
+    assert np.abs(run.result["slave.x"] - exact).max() < 1e-12
+    assert run.result.summary["discontinuities"] == 1
