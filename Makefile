@@ -10,7 +10,7 @@ demo: fmus ## the paper's quarter car: two FMU processes, one master, over Zenoh
 	$(BIN)/master-node run examples/quarter_car/displacement.toml --output demo_results
 
 test: fmus ## the whole test suite
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 check: $(STAMP) ## linter, formatter, type checker, import layers
 	$(BIN)/ruff check .

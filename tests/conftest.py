@@ -18,6 +18,7 @@ from types import ModuleType
 
 import psutil
 import pytest
+from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -33,6 +34,13 @@ settings.load_profile("doublestep")
 
 _MARK = "DOUBLESTEP_TEST_SESSION"
 _TIME_TO_END = 3.0
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """One test at a time starts processes: workers share the machine, and its time."""
+    for item in items:
+        if "no_process_left" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.xdist_group("processes"))
 
 
 def _example(folder: str, script: str) -> ModuleType:
@@ -78,9 +86,13 @@ def quarter_car_ssp(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def capability_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with the FMUs of all capabilities."""
-    folder = tmp_path_factory.mktemp("capabilities")
-    _example("capabilities", "build").build(folder)
+    """The folder with the FMUs of all capabilities: one, also for several workers."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    folder /= "capabilities"
+    with FileLock(f"{folder}.lock"):
+        _example("capabilities", "build").build(folder)
     return folder
 
 
