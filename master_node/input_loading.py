@@ -6,14 +6,9 @@ Nothing is started before all of this is read and checked.
 from __future__ import annotations
 
 import csv
-import hashlib
-import importlib
-import importlib.util
-import sys
 from collections.abc import Callable, Mapping
 from math import isfinite
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from zipfile import BadZipFile
 
@@ -28,6 +23,7 @@ from protocol.errors import ConfigurationError
 from protocol.names import nearest
 from protocol.signals import FloatArray
 from protocol.slave import StartValue
+from protocol.user_code import load_module
 
 Columns = Mapping[str, NDArray[Any]]
 """The columns of a file by name, in its order; texts out of a CSV file."""
@@ -244,40 +240,9 @@ def _load_function(reference: str, base: Path) -> Callable[[float], Any]:
             f"{reference!r} does not name a function",
             remedy="write package.module:name or path/to/file.py:name",
         )
-    module = _from_file(base / place) if place.endswith(".py") else _installed(place)
+    module = load_module(place, base)
     function = getattr(module, name, None)
     if not callable(function):
         names = [key for key, value in vars(module).items() if callable(value)]
         raise ConfigurationError(f"{reference!r}: no function {name!r} there{nearest(name, names)}")
     return function  # type: ignore[no-any-return]
-
-
-def _from_file(path: Path) -> ModuleType:
-    path = path.resolve()
-    if not path.is_file():
-        beside = sorted(p.name for p in path.parent.glob("*.py"))
-        raise ConfigurationError(f"no file {path}{nearest(path.name, beside)}")
-    # A name of its own, so that it can neither hide nor be hidden by an installed module.
-    name = f"{path.stem}_{hashlib.sha256(bytes(path)).hexdigest()[:16]}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None  # a path that ends in .py always has a loader
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses and inspect look there
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        del sys.modules[name]
-        raise _import_failure(str(path), error) from error
-    return module
-
-
-def _installed(name: str) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except (Exception, SystemExit) as error:
-        raise _import_failure(name, error) from error
-
-
-def _import_failure(place: str, error: BaseException) -> ConfigurationError:
-    return ConfigurationError(f"import of {place} failed: {type(error).__name__}: {error}")

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -120,15 +119,6 @@ class Model:
         ``dx`` is x', ``du`` is u'. Not written, and not every output a state: the slave has none.
         """
         return dx[self._output_states]
-
-
-def error_text(error: BaseException) -> str:
-    """An exception of a user's code in one line, with the place where it was raised."""
-    text = f"{type(error).__name__}: {error}"
-    frames = traceback.extract_tb(error.__traceback__)
-    return (
-        f"{text} ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else text
-    )
 
 
 def describe(model: type[Model]) -> SlaveDescription:

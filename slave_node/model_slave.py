@@ -38,7 +38,8 @@ from protocol.slave import (
     VariableType,
     refuse_discrete,
 )
-from slave_node.model import Model, describe, error_text, real
+from protocol.user_code import error_text
+from slave_node.model import Model, describe, real
 
 __all__ = ["Model", "ModelSlave", "ModelState", "real"]
 
