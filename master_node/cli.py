@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -23,10 +23,10 @@ from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunE
 from protocol.logs import LogFormat, about, configure_logs, logs_json
 
 if TYPE_CHECKING:  # each command imports what it needs
+    from master_node.observers import Observer
     from master_node.study.directory import StudyDirectory
     from master_node.study.runner import Runner
-if TYPE_CHECKING:
-    from master_node.observers import Observer
+    from master_node.windows import Window
 
 app = typer.Typer(
     help="Co-simulation master with error-controlled communication step sizes.",
@@ -414,14 +414,8 @@ def list_(
 
     from master_node.listing import listing_data, listing_tables  # noqa: PLC0415
     from master_node.survey import survey  # noqa: PLC0415
-    from master_node.windows import windows  # noqa: PLC0415
 
-    with (
-        _interruptible(),
-        windows(
-            connect or (), listen or (), insecure=insecure, credentials=_credentials(tls)
-        ) as opened,
-    ):
+    with _windows(connect, listen, insecure=insecure, tls=tls) as opened:
         for window in opened:
             if window.failure is not None:
                 log.warning("%s", window.failure)
@@ -447,14 +441,8 @@ def doctor(
 
     from master_node.doctor import diagnose  # noqa: PLC0415
     from master_node.plain_text import plain  # noqa: PLC0415
-    from master_node.windows import windows  # noqa: PLC0415
 
-    with (
-        _interruptible(),
-        windows(
-            connect or (), listen or (), insecure=insecure, credentials=_credentials(tls)
-        ) as opened,
-    ):
+    with _windows(connect, listen, insecure=insecure, tls=tls) as opened:
         diagnosis = diagnose(opened)
     for table in diagnosis.tables():
         Console().print(table)
@@ -463,6 +451,21 @@ def doctor(
     if diagnosis.problems:
         raise typer.Exit(1)
     typer.echo("no problem found")
+
+
+@contextmanager
+def _windows(
+    connect: Sequence[str] | None, listen: Sequence[str] | None, *, insecure: bool, tls: Path | None
+) -> Iterator[list[Window]]:
+    """Views of the bus at these addresses, see `master_node.windows.windows`."""
+    from master_node.windows import windows  # noqa: PLC0415
+
+    credentials = _credentials(tls)
+    with (
+        _interruptible(),
+        windows(connect or (), listen or (), insecure=insecure, credentials=credentials) as opened,
+    ):
+        yield opened
 
 
 def _credentials(directory: Path | None) -> Credentials | None:
