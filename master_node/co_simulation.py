@@ -25,6 +25,7 @@ from master_node.coupling_scheme import (
 from master_node.defect_run import DefectRun
 from master_node.fixed_run import FixedRun
 from master_node.initialization import initialize
+from master_node.interrupts import Interrupts
 from master_node.mixed_run import MixedRun
 from master_node.numerics.error_estimators import ESTIMATORS
 from master_node.observers import DiscreteType, Observer, Outcome, RunEnd, RunStart, Statistics
@@ -192,12 +193,16 @@ class CoSimulation:
             for slave, restarts in self.checkpoints.restarts().items():
                 statistics.slaves[slave].restarts = restarts
 
+        interrupts = Interrupts()
         outcome, message = Outcome.FAILED, ""
         try:
             self.checkpoints.begin(statistics, update)
             try:
-                with np.errstate(over="ignore", invalid="ignore"):  # the norm finds them
-                    note = self._steps(scheme, outputs, statistics)
+                with (
+                    np.errstate(over="ignore", invalid="ignore"),  # the norm finds them
+                    interrupts.deferrable(),
+                ):
+                    note = self._steps(scheme, outputs, statistics, interrupts)
             finally:
                 update()
                 self.group.restart_statistics()
@@ -215,7 +220,13 @@ class CoSimulation:
             self.observer.ended(RunEnd(outcome, statistics, message))
         return statistics
 
-    def _steps(self, scheme: CouplingScheme, outputs: Outputs, statistics: Statistics) -> str:
+    def _steps(
+        self,
+        scheme: CouplingScheme,
+        outputs: Outputs,
+        statistics: Statistics,
+        interrupts: Interrupts,
+    ) -> str:
         """Step to the end; a slave's wish to end earlier is returned in words."""
         context = RunContext(
             self.group,
@@ -224,6 +235,7 @@ class CoSimulation:
             self.system,
             self.observer,
             statistics,
+            interrupts,
             self.checkpoints,
             self.resumed,
         )

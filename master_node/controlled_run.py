@@ -97,6 +97,7 @@ class ControlledRun:
         self._coupled = coupled
         self._scheme = scheme
         self._observer = context.observer
+        self._interrupts = context.interrupts
         self._statistics = context.statistics
         self._checkpoints = context.checkpoints
         self._resumed = context.resumed
@@ -532,20 +533,22 @@ class ControlledRun:
         self, step: DoubleStep, error: StepError, reached: Reached, points: Points
     ) -> None:
         times, (order, slopes) = step.times, highest(step.polynomials)
-        count_accepted(self._statistics, times.first, reached)
         limiting = error.limiting_variable
-        self._observer.attempted(
-            Attempt(times.begin, times.first, order, slopes, error.norm, True, limiting, points)
-        )
+        with self._interrupts:
+            count_accepted(self._statistics, times.first, reached)
+            self._observer.attempted(
+                Attempt(times.begin, times.first, order, slopes, error.norm, True, limiting, points)
+            )
 
     def _tell_rejected(
         self, times: DoubleStepTimes, polynomials: Polynomials, norm: float, reason: str
     ) -> None:
-        self._statistics.rejected_double_steps += 1
         order, slopes = highest(polynomials)
-        self._observer.attempted(
-            Attempt(times.begin, times.first, order, slopes, norm, False, reason)
-        )
+        with self._interrupts:
+            self._statistics.rejected_double_steps += 1
+            self._observer.attempted(
+                Attempt(times.begin, times.first, order, slopes, norm, False, reason)
+            )
 
 
 def _reached(step: DoubleStep) -> Reached:

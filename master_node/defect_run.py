@@ -78,6 +78,7 @@ class DefectRun:
         self._coupled = context.coupled
         self._scheme = scheme
         self._observer = context.observer
+        self._interrupts = context.interrupts
         self._statistics = context.statistics
         self._checkpoints = context.checkpoints
         self._resumed = context.resumed
@@ -275,10 +276,11 @@ class DefectRun:
 
     def _tell(self, attempt: Attempt, reached: Reached, points: Points) -> None:
         """Tell the observers of a step and count it."""
-        count_accepted(self._statistics, attempt.step_size, reached)
-        if not attempt.error_norm <= 1.0:
-            self._statistics.steps_above_tolerance += 1
-        self._observer.attempted(attempt._replace(points=points))
+        with self._interrupts:
+            count_accepted(self._statistics, attempt.step_size, reached)
+            if not attempt.error_norm <= 1.0:
+                self._statistics.steps_above_tolerance += 1
+            self._observer.attempted(attempt._replace(points=points))
 
 
 def _attempt(time: float, size: float, polynomials: Polynomials, error: CouplingError) -> Attempt:

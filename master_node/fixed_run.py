@@ -83,11 +83,12 @@ class FixedRun:
             context.checkpoints.settle()
             history = history.pushed(end, coupled.inputs_of(outputs.y))
             reached = (ReachedPoint(end, *outputs),)
-            count_accepted(context.statistics, step.step_size, reached)
             order, slopes = highest(polynomials)
             points = results.reached(reached, order)
-            context.observer.attempted(
-                Attempt(time, step.step_size, order, slopes, _NAN, True, "", points)
-            )
+            with context.interrupts:
+                count_accepted(context.statistics, step.step_size, reached)
+                context.observer.attempted(
+                    Attempt(time, step.step_size, order, slopes, _NAN, True, "", points)
+                )
             context.checkpoints.reached(_Position(n, history, outputs), results.memory)
         return ""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from master_node.checkpoints import Checkpoints, Resumed
 from master_node.configuration import System
 from master_node.coupling_scheme import CouplingScheme
+from master_node.interrupts import Interrupts
 from master_node.observers import Observer, Statistics
 from master_node.slave_group import SlaveGroup
 from master_node.system import CoupledSystem
@@ -23,6 +24,7 @@ class RunContext:
         system: the settings.
         observer: is told of every step.
         statistics: are counted up.
+        interrupts: wait while a step is told and counted.
         checkpoints: are told where the run stands.
         resumed: where it goes on; None: at T_0.
     """
@@ -33,5 +35,6 @@ class RunContext:
     system: System
     observer: Observer
     statistics: Statistics
+    interrupts: Interrupts
     checkpoints: Checkpoints
     resumed: Resumed | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import signal
 from collections import defaultdict
 from collections.abc import Sequence
 from itertools import pairwise
@@ -787,8 +788,8 @@ def test_the_summary_agrees_with_the_steps(fmu_dir: Path) -> None:
     assert set(taken["limiting_variable"]) <= set(STATES)
 
 
-class Interrupts:
-    """An observer at whose side somebody presses Ctrl-C after ``n`` attempts."""
+class CtrlC:
+    """An observer at whose side somebody presses Ctrl-C when it hears of the attempt ``n``."""
 
     def __init__(self, n: int) -> None:
         self.left = n
@@ -801,28 +802,38 @@ class Interrupts:
         """Now."""
         self.left -= 1
         if self.left == 0:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
 
     def ended(self, end: RunEnd) -> None:
         """Note it."""
         self.end = end
 
 
-def test_ctrl_c_keeps_what_was_accepted(tmp_path: Path) -> None:
-    """The run ends with its own error and exit code; the results say so and are readable."""
-    observer = Interrupts(10)
+@pytest.mark.parametrize("estimator", ["mod", "none"])
+def test_ctrl_c_keeps_what_was_accepted(estimator: str, tmp_path: Path) -> None:
+    """The run ends with its own error and exit code; the results say so and are readable.
+
+    Who is told of the step later, here the files, hears of all of it: Ctrl-C waits until then.
+    What handles it afterwards is what handled it before.
+    """
+    observer = CtrlC(10)
+    before = signal.getsignal(signal.SIGINT)
     with pytest.raises(InterruptedRunError, match=r"interrupted at t=") as info:
         simulate(
             load_system(EXAMPLES / "displacement_python.toml"),
             output=tmp_path / "out",
             in_process=True,
             observers=[observer],
+            estimator=estimator,
         )
     assert info.value.exit_code == 130
+    assert signal.getsignal(signal.SIGINT) is before
     result = Result.load(tmp_path / "out")
     assert result.summary["outcome"] == "interrupted"
-    assert len(result.steps) == 9  # the files had not heard of the tenth
-    assert len(result.time) == 1 + 2 * len(accepted(result))
+    assert len(result.steps) == 10
+    steps = len(accepted(result)) * (1 if estimator == "none" else 2)
+    assert len(result.time) == 1 + steps
+    assert result.summary["communication_steps"] == steps
     assert observer.end is not None
     assert observer.end.outcome == "interrupted"
 

@@ -6,8 +6,7 @@ examples that are not here are run where their subject is tested.
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +25,14 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(scope="module")
-def capabilities(capability_dir: Path) -> Iterator[Path]:
+@pytest.fixture
+def capabilities(capability_dir: Path, tmp_path: Path) -> Path:
     """The folder of the examples for single capabilities, as it is once its FMUs are built."""
-    copies = [
-        Path(shutil.copy(file, capability_dir))
-        for file in (EXAMPLES / "capabilities").glob("*.toml")
-    ]
-    yield capability_dir
-    for copy in copies:
-        copy.unlink()
+    folder = tmp_path / "capabilities"
+    folder.mkdir()
+    for file in (*capability_dir.glob("*.fmu"), *(EXAMPLES / "capabilities").glob("*.toml")):
+        (folder / file.name).symlink_to(file)
+    return folder
 
 
 Run = Callable[..., Result]

@@ -763,7 +763,7 @@ def cluster(distributed: ModuleType) -> Iterator[Any]:
         threads_per_worker=2,
         processes=True,
         resources={"solver": 1},
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
         host="127.0.0.1",
     ) as started:
         yield started
