@@ -651,7 +651,7 @@ def folder(tmp_path: Path) -> Path:
         ({"function": "functions.py:text"}, "no function 'text' there"),
         ({"function": "function.py:f"}, "no file .*function.py; did you mean 'functions.py'"),
         ({"function": "broken.py:f"}, "import of .*broken.py failed: ModuleNotFoundError"),
-        ({"function": "no.such:f"}, "import of no.such failed"),
+        ({"function": "no.such:f"}, "no module 'no'; install its package"),
         ({"function": "functions.py:g"}, "oscillator.u is of type Real and cannot be 'x'"),
         ({"function": "functions.py:h"}, "the function is nan at t=0.0 s"),
         ({"function": "functions.py:f", "breakpoints": [math.inf]}, "must be finite"),
