@@ -183,7 +183,9 @@ def remedy(
     if refusal and description.input_derivatives is InputDerivatives.NATIVE:
         return Remedy(
             replace(configuration, input_substeps=MAX_ORDER + 1),
-            warnings=(f"{name}: it refuses input derivatives, so they are emulated: {refusal}",),
+            warnings=(
+                f"{name}: its input derivatives are emulated, as it takes not all: {refusal}",
+            ),
         )
     if refusal:
         raise SlaveError(refusal, slave=name, phase=SetInputs.verb)
