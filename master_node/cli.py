@@ -126,9 +126,7 @@ def run(  # noqa: PLR0917  options of the command line
     listen: Annotated[
         list[str] | None, typer.Option(help="Where slaves can connect, tcp/HOST:PORT.")
     ] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
-    ] = False,
+    insecure: Insecure = False,
     tls: Tls = None,
     mode: Annotated[
         str | None, typer.Option(help="peer: reach slaves directly; client: through a router.")

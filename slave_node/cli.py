@@ -48,9 +48,15 @@ Model = Annotated[
     str, typer.Argument(help="An .fmu file, package.module:Class or path/to/file.py:Class.")
 ]
 
+Insecure = Annotated[bool, typer.Option("--insecure", help="Allow addresses other than loopback.")]
+
 Tls = Annotated[
     Path | None,
     typer.Option(metavar="DIR", help="Certificates: encrypt, and let in only who has one."),
+]
+
+BusMode = Annotated[
+    Mode, typer.Option(help="peer: reach masters directly; client: through a router.")
 ]
 
 
@@ -70,13 +76,9 @@ def serve(  # noqa: PLR0917  options of the command line
     parameter: Annotated[
         list[str] | None, typer.Option(help="Start value, name=value; may be repeated.")
     ] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
-    ] = False,
+    insecure: Insecure = False,
     tls: Tls = None,
-    mode: Annotated[
-        Mode, typer.Option(help="peer: reach masters directly; client: through a router.")
-    ] = Mode.PEER,
+    mode: BusMode = Mode.PEER,
     metrics_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Serve metrics for Prometheus there.")
     ] = None,
@@ -176,9 +178,7 @@ def router(
         typer.Option(help=f"Address for masters and slaves [default: {DEFAULT_ENDPOINT}]."),
     ] = None,
     connect: Annotated[list[str] | None, typer.Option(help="Another router.")] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
-    ] = False,
+    insecure: Insecure = False,
     tls: Tls = None,
 ) -> None:
     """Connect masters and slaves in mode client with each other, until SIGTERM or Ctrl-C."""
@@ -218,9 +218,7 @@ def check(  # noqa: PLR0917  options of the command line
     connect: Annotated[
         str, typer.Option(help="Router, or the slave or agent itself where it listens.")
     ] = DEFAULT_ENDPOINT,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
-    ] = False,
+    insecure: Insecure = False,
     tls: Tls = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="For the connection [s].")] = 3.0,
 ) -> None:
@@ -289,13 +287,9 @@ def agent(  # noqa: PLR0917  options of the command line
     listen: Annotated[
         list[str] | None, typer.Option(help="Address on which masters reach agent and slaves.")
     ] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Allow addresses other than loopback.")
-    ] = False,
+    insecure: Insecure = False,
     tls: Tls = None,
-    mode: Annotated[
-        Mode, typer.Option(help="peer: reach masters directly; client: through a router.")
-    ] = Mode.PEER,
+    mode: BusMode = Mode.PEER,
 ) -> None:
     """Start slaves on this host when masters ask for them, until SIGTERM or Ctrl-C."""
     from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  each command imports what it needs

@@ -40,7 +40,6 @@ class StudyTable:
     """
 
     def __init__(self, plan: Plan) -> None:
-        self._plan = plan
         self._outputs = plan.study.results.outputs
         self.columns = ("run", *plan.parameters, *_COLUMNS, *self._outputs, "message")
         for name in self._outputs:

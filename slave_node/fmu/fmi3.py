@@ -193,7 +193,6 @@ class Fmi3Slave(FmuSlave):
         )
         super().__init__(self._fmi3)
         self._has_event_mode = model.interface.has_event_mode
-        self._follows_inputs = bool(model.interface.intermediate_inputs)
         self._event, self._end, self._early = (ctypes.c_bool() for _ in range(3))
         self._reached = ctypes.c_double()
         results = [
