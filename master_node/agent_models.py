@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from protocol.agents import (
 )
 from protocol.bus import Bus
 from protocol.errors import ModelError, ProtocolError, SlaveLostError
+from protocol.files import file_sha256
 from protocol.keys import MODELS, UPLOAD, AgentKey
 
 log = logging.getLogger("master_node")
@@ -89,8 +89,7 @@ def wanted_model(system: System, slave: str) -> WantedModel:
     try:
         if (is_python and not path.endswith(".py")) or not file.is_file():
             return WantedModel(slave, None, file_name, python_class)
-        with file.open("rb") as source:
-            digest = hashlib.file_digest(source, "sha256").hexdigest()
+        digest = file_sha256(file)
         size = file.stat().st_size
     except OSError as error:
         raise ModelError(f"{file} cannot be read: {error}", slave=slave) from error

@@ -215,8 +215,7 @@ class CoSimulation:
             message = str(error)
             raise
         finally:
-            is_complete = outcome in (Outcome.COMPLETED, Outcome.TERMINATED)
-            self.checkpoints.end(is_complete=is_complete)
+            self.checkpoints.end(is_complete=outcome.is_complete)
             self.observer.ended(RunEnd(outcome, statistics, message))
         return statistics
 

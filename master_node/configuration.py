@@ -35,7 +35,7 @@ from pydantic_core import ErrorDetails
 from master_node.numerics.dense_output import OutputGrid
 from master_node.numerics.extrapolation import InputPolynomial
 from master_node.toml_files import read_located_tables
-from protocol.agents import check_label
+from protocol.agents import check_label, is_sha256
 from protocol.errors import ConfigurationError
 from protocol.keys import check_name
 from protocol.names import nearest
@@ -78,9 +78,10 @@ def _labels(value: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _sha256(value: str) -> str:
-    if len(value) != 64 or set(value.lower()) - set("0123456789abcdef"):
+    value = value.lower()
+    if not is_sha256(value):
         raise ValueError("write 64 hexadecimal digits")
-    return value.lower()
+    return value
 
 
 def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:

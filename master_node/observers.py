@@ -125,6 +125,11 @@ class Outcome(StrEnum):
     INTERRUPTED = "interrupted"
     FAILED = "failed"
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether the run got to its end; others may be resumed."""
+        return self in (Outcome.COMPLETED, Outcome.TERMINATED)
+
 
 @dataclass(slots=True)
 class SlaveStatistics:

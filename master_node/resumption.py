@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from master_node.configuration import InputSettings, System
 from master_node.system_files import open_system
 from protocol.errors import ConfigurationError, ResultsError
+from protocol.files import file_sha256
 from protocol.slave import SlaveDescription
 
 
@@ -110,6 +110,6 @@ def _input_files(system: System) -> list[str]:
 
 def _sha256(path: Path) -> str:
     try:
-        return sha256(path.read_bytes()).hexdigest()
+        return file_sha256(path)
     except OSError:
         return ""

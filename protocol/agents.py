@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -105,12 +105,8 @@ class AgentStatus:
 
     def lacks(self, requires: Mapping[str, str]) -> list[str]:
         """What it has not of ``requires``, as ``name = value``; all licences may be taken."""
-        licences = {licence.name for licence in self.licences}
-        return [
-            f"{name} = {value}"
-            for name, value in requires.items()
-            if self.labels.get(name) != value and not (name == LICENCE and value in licences)
-        ]
+        missing = lacking(requires, self.labels, {licence.name for licence in self.licences})
+        return [f"{name} = {value}" for name, value in missing.items()]
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,6 +274,17 @@ Record = (
     | SlaveOutput
     | Done
 )
+
+
+def lacking(
+    requires: Mapping[str, str], labels: Mapping[str, str], licences: Container[str]
+) -> dict[str, str]:
+    """What of ``requires`` an agent with these labels and counted licences has not."""
+    return {
+        name: value
+        for name, value in requires.items()
+        if labels.get(name) != value and not (name == LICENCE and value in licences)
+    }
 
 
 def check_label(name: str, value: str) -> None:

@@ -784,11 +784,16 @@ def decode_map(data: bytes) -> dict[str, StartValue]:
         MalformedMessageError: not a flat map.
         DoublestepError: what the map reports, if it is an error reply.
     """
+    return {name: _start_value(v, name) for name, v in _message(data).items() if v is not None}
+
+
+def _message(data: bytes) -> dict[str, Any]:
+    """The values of a map with a version; raises the error that it reports."""
     values = _mapping(_unpack(data, "a message"), "a message")
     _check_version(values.pop("version", None))
     if "error" in values:
         raise DoublestepError.from_reply(values)
-    return {name: _start_value(v, name) for name, v in values.items() if v is not None}
+    return values
 
 
 def encode_error_map(error: DoublestepError) -> bytes:
@@ -874,8 +879,4 @@ def decode_record(cls: type[_R], data: bytes) -> _R:
         DoublestepError: what the message reports, if it is an error reply; or what the record
             does not allow.
     """
-    values = _mapping(_unpack(data, "a message"), "a message")
-    _check_version(values.pop("version", None))
-    if "error" in values:
-        raise DoublestepError.from_reply(values)
-    return _record(cls, values, _RECORD_FIELDS[cls])  # type: ignore[no-any-return]
+    return _record(cls, _message(data), _RECORD_FIELDS[cls])  # type: ignore[no-any-return]

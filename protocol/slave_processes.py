@@ -116,8 +116,7 @@ class SlaveProcess:
 
     def kill(self) -> None:
         """End it at once."""
-        if self._process.poll() is None:
-            self._process.kill()
+        self._process.kill()
 
 
 def end_all(processes: Iterable[SlaveProcess], *, at_once: bool = False) -> None:

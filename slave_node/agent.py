@@ -35,8 +35,10 @@ from protocol.agents import (
     Upload,
     UploadState,
     is_sha256,
+    lacking,
 )
 from protocol.bus import Bus
+from protocol.clock import SYSTEM_CLOCK, Timer
 from protocol.codec import decode_record, encode_error_map, encode_record
 from protocol.errors import (
     ConfigurationError,
@@ -113,7 +115,7 @@ class _Run:
     slaves: dict[str, tuple[StartSlave, SlaveProcess]] = field(default_factory=dict)
     changes: int = 0
     ending: bool = False
-    look: threading.Timer | None = None
+    look: Timer | None = None
 
 
 _R = TypeVar("_R", bound=Record)
@@ -301,13 +303,11 @@ class Agent:
         if self._closed:
             raise SlaveLostError("the agent is ending")
         offer = self._offer
-        for name, value in request.requires.items():
-            counted = name == LICENCE and value in offer.licences
-            if not counted and offer.labels.get(name) != value:
-                raise ConfigurationError(
-                    f"it has no {name} = {value}",
-                    remedy=f"start the agent with --label {name}={value}",
-                )
+        for name, value in lacking(request.requires, offer.labels, offer.licences).items():
+            raise ConfigurationError(
+                f"it has no {name} = {value}",
+                remedy=f"start the agent with --label {name}={value}",
+            )
         wanted = request.requires.get(LICENCE)
         for licence in self._licences():
             if licence.name == wanted and not licence.free:
@@ -413,9 +413,8 @@ class Agent:
                 return
             if known.look is not None:
                 known.look.cancel()
-            known.look = threading.Timer(wait, self._end_orphans, (run, known.changes))
-            known.look.daemon = True
-            known.look.start()
+            changes = known.changes
+            known.look = SYSTEM_CLOCK.later(wait, lambda: self._end_orphans(run, changes))
 
     def _end_orphans(self, run: str, changes: int) -> None:
         with self._lock:

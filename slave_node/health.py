@@ -23,9 +23,9 @@ def check_alive(bus: Bus, name: str, *, agent: bool = False) -> None:
     alive_named, kind = (alive_agents, "agent") if agent else (alive_slaves, "slave")
     if bus.alive(alive_named(name) if name else alive_routers(), _TOKEN_TIME):
         return
-    there = sorted({key.split("/")[2] for key in bus.alive(alive_named("*"), _TOKEN_TIME)})
     if not name:
         raise SlaveLostError("no router is on the bus", phase="check")
+    there = sorted({key.split("/")[2] for key in bus.alive(alive_named("*"), _TOKEN_TIME)})
     raise SlaveLostError(
         f"is not on the bus; found there: {', '.join(there) or f'no {kind} at all'}",
         slave=name,

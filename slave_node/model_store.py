@@ -6,7 +6,6 @@ is there.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import re
 import threading
@@ -15,6 +14,7 @@ from pathlib import Path
 
 from protocol.agents import AgentModel
 from protocol.errors import ConfigurationError
+from protocol.files import file_sha256
 
 log = logging.getLogger("slave_node")
 
@@ -107,9 +107,3 @@ class ModelStore:
         if known and (known.size, known.changed) == (status.st_size, status.st_mtime_ns):
             return known
         return _Hashed(status.st_size, status.st_mtime_ns, file_sha256(path))
-
-
-def file_sha256(path: Path) -> str:
-    """Of a file, in lower-case hexadecimal digits; raises `OSError`."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

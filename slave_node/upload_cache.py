@@ -20,7 +20,7 @@ from secrets import token_hex
 
 from protocol.agents import AgentModel, Upload, UploadState, is_sha256
 from protocol.errors import ConfigurationError, ModelError, ProtocolError
-from slave_node.model_store import file_sha256
+from protocol.files import file_sha256
 
 log = logging.getLogger("slave_node")
 

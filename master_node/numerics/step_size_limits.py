@@ -185,12 +185,7 @@ class StepSizeLimits:
         quantum, zero = self.quantum, _decimal(origin)
         done = self._units(origin, begin)
         left_units = (self._units(origin, target) - done) // 2
-        units = max(self._fewest, int(_decimal(step_size) // quantum))
-        if units >= left_units:
-            units = left_units
-        elif 2 * units > left_units:
-            units = (left_units + 1) // 2
-        units = max(1, _planned(units, left_units, self._fewest, self._most, 0))
+        units = self._planned_units(step_size, left_units)
         size = float(units * quantum)
         middle = float(zero + (done + units) * quantum)
         end = float(zero + (done + 2 * units) * quantum)
@@ -212,13 +207,19 @@ class StepSizeLimits:
         quantum, zero = self.quantum, _decimal(origin)
         done = self._units(origin, begin)
         units_left = self._units(origin, target) - done
-        units = max(self._fewest, int(_decimal(step_size) // quantum))
-        if units >= units_left:
-            units = units_left
-        elif 2 * units > units_left:
-            units = (units_left + 1) // 2
-        units = max(1, _planned(units, units_left, self._fewest, self._most, 0))
+        units = self._planned_units(step_size, units_left)
         return float(zero + (done + units) * quantum), float(units * quantum)
+
+    def _planned_units(self, step_size: float, left: int) -> int:
+        """Of how many quanta the next H is, with ``left`` of them to fill."""
+        assert self.quantum is not None
+        fewest = self._fewest
+        units = max(fewest, int(_decimal(step_size) // self.quantum))
+        if units >= left:
+            units = left
+        elif 2 * units > left:
+            units = (left + 1) // 2
+        return max(1, _planned(units, left, fewest, self._most, 0))
 
     def _rounding(self, begin: float, end: float) -> float:
         """By what H of a double step between these times may miss its bounds [s]."""

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from time import monotonic
 
-from master_node.observers import Attempt, Outcome, Point, Points, RunEnd, RunStart
+from master_node.observers import Attempt, Point, Points, RunEnd, RunStart
 from master_node.results.columns import Columns
 from master_node.results.csv_file import CsvFile
 from master_node.results.files import (
@@ -160,8 +160,7 @@ class ResultsWriter:
         errors: list[ResultsError] = []
         summary = summarize(self._start, end, self._settings)
         self._append(end.points)
-        is_complete = end.outcome in (Outcome.COMPLETED, Outcome.TERMINATED)
-        self._keeps_stream = self._can_resume and not is_complete
+        self._keeps_stream = self._can_resume and not end.outcome.is_complete
         for finish in (
             self._flush,
             self._close,

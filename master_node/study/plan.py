@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -23,6 +22,7 @@ from master_node.study.configuration import Study
 from master_node.system import CoupledSystem, resolve
 from master_node.system_files import open_system
 from protocol.errors import ConfigurationError, DoublestepError
+from protocol.files import file_sha256
 from protocol.names import nearest
 from protocol.slave import SlaveDescription, VariableType
 
@@ -179,5 +179,5 @@ def _hashes_of_input_files(system: System) -> dict[str, str]:
         if isinstance(file, str):
             path = system.base / (file.rpartition(":")[0] if setting.function else file)
             if path.is_file():  # a function may be in a package instead
-                hashes[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+                hashes[name] = file_sha256(path)
     return hashes

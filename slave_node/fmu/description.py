@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from xml.etree.ElementTree import Element
 from fmpy import read_model_description
 
 from protocol.errors import ModelError
+from protocol.files import file_sha256
 from protocol.slave import Causality, SlaveDescription, StartValue, StateKind, VariableType
 from slave_node.fmu.archive import extract
 from slave_node.fmu.embedded_python import log_categories, slave_module
@@ -152,7 +152,7 @@ def _description(
         default_step_size=default_step_size(model_description),
         units=units(model_description),
         remarks=remarks,
-        sha256=hashlib.sha256(fmu.read_bytes()).hexdigest(),
+        sha256=file_sha256(fmu),
         guid=model_description.guid or "",
         generation_tool=model_description.generationTool or "",
     )

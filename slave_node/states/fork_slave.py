@@ -412,7 +412,7 @@ class ForkSlave(Slave):
         """See `Slave`. Needs no fork where no other state has this one for its origin."""
         saved = self._state(state)
         self._habits.note(Event.GIVE_UP, len(self._saved))
-        is_last = not any(s.origin is saved.origin for s in self._saved - {saved})
+        is_last = self._is_last_of_origin(saved)
         self._note_use(saved, Event.GIVE_UP)
         if is_last and not saved.trail.tasks:
             self._saved.discard(saved)
@@ -515,10 +515,14 @@ class ForkSlave(Slave):
         self._note_use(state, None)
         if state.copy is not None:
             self._end_process(state.copy)
-        if not any(other.origin is state.origin for other in self._saved):
+        if self._is_last_of_origin(state):
             self._end_process(state.origin)
             if self._origin is state.origin:
                 self._origin = self._trail = None
+
+    def _is_last_of_origin(self, state: _State) -> bool:
+        """Whether no other saved state has the origin of this one."""
+        return not any(o is not state and o.origin is state.origin for o in self._saved)
 
     def _end_process(self, holder: HeldProcess) -> None:
         if holder in self._unconfirmed:
