@@ -374,7 +374,7 @@ def export(
         Path | None, typer.Option("--output", "-o", help="Package [default: SYSTEM.ssp].")
     ] = None,
 ) -> None:
-    """Write a system and its FMUs as an SSP 1.0 package."""
+    """Write a system and its FMUs as an SSP package."""
     from master_node.system_files import export_system  # noqa: PLC0415
 
     path = output or system_file.with_suffix(".ssp")
