@@ -29,21 +29,15 @@ from protocol.errors import (
     DoublestepError,
     MalformedMessageError,
     SlaveCrashedError,
-    SlaveKilledError,
 )
 from protocol.logs import LogFormat, configure_logs
 from protocol.slave import CallExecutor, SlaveDescription, StartValue
+from slave_node.deaths import death
 from slave_node.pipe import Pipe
 
 _END = b""
 _CLOSE_TIME = 0.5
 _PR_SET_PDEATHSIG = 1
-_FROM_OUTSIDE = frozenset(
-    getattr(signal, name)
-    for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT")
-    if hasattr(signal, name)
-)
-"""Signals that a model does not get by what it does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,13 +195,7 @@ class WorkerProcess:
         self._process.join(_CLOSE_TIME)
         code = self._process.exitcode
         self._discard()
-        kind, how = SlaveCrashedError, f"ended with exit code {code}"
-        if code is not None and code < 0:
-            number = signal.Signals(-code)
-            how = f"died by {number.name}"
-            if number in _FROM_OUTSIDE:
-                kind = SlaveKilledError
-        return kind(f"the process that held the model {how}")
+        return death(code)
 
     def _discard(self) -> None:
         if self._process is not None:

@@ -33,6 +33,7 @@ from protocol.errors import (
     ModelError,
     SlaveCrashedError,
     SlaveError,
+    SlaveKilledError,
     StepRejectedError,
 )
 from protocol.slave import Causality, Slave, SlaveDescription, StateKind, StepStatus, VariableType
@@ -438,7 +439,7 @@ def test_a_killed_saved_state_is_named(fmu_dir: Path) -> None:
         state = slave.get_state()
         (saved,) = family() - before
         saved.kill()
-        with pytest.raises(SlaveCrashedError, match="died by SIGKILL"):
+        with pytest.raises(SlaveKilledError, match="died by SIGKILL"):
             slave.set_state(state)
         assert slave.do_step(0.0, 1e-3, True).status is StepStatus.OK
 
@@ -507,7 +508,7 @@ def test_a_killed_holder_is_an_error_of_the_slave_and_the_worker_goes_on(tmp_pat
     holder.kill()
     wait_until(lambda: bool(ends))
     assert isinstance(ends[0], bytes)
-    assert b"StepRejectedError" in ends[0]
+    assert b"SlaveKilledError" in ends[0]
     assert b"died by SIGKILL" in ends[0]
     again = [SetState(0), SetInputs(ONE), DoStep(0.0, 0.1)]
     answer = decode_reply(again, worker.execute(encode_program(again)))

@@ -120,6 +120,21 @@ def test_killed_slaves_come_back(
         assert re.search(r"; started again and restored in \d+\.\d s: the run goes on$", text)
 
 
+def test_killed_holders_come_back(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A model in a process that forks is killed in mid step: no rejected step, the same files."""
+    simulation = FEW_STEPS + 'estimator = "mod"\n'
+    system = car(tmp_path / "b", simulation, traps="0.02 kill worker, 0.04 kill worker")
+    chassis = system.slaves["chassis"].model_copy(update={"state": "fork"})
+    forking = system.model_copy(update={"slaves": {**system.slaves, "chassis": chassis}})
+    undisturbed = files(car(tmp_path / "a", simulation), tmp_path / "a", in_process=True)
+    caplog.clear()
+    assert files(forking, tmp_path / "b") == undisturbed
+    told = warnings(caplog)
+    assert len(told) == 2
+    for text in told:
+        assert re.match(r"chassis: do_step at t=\S+ s, H=\S+ s: .* SIGKILL; started again", text)
+
+
 def test_killed_fmus_come_back_from_their_saved_states(
     tmp_path: Path, fmu_dir: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -79,8 +79,11 @@ class HolderFamily:
         if self._keeper.poll() is not None:
             self._kill()
 
-    def death(self, process: int) -> str:
-        """How a holder died whose channel is closed, in words; 0 is one that nobody has met."""
+    def exit_code(self, process: int) -> int | None:
+        """Of a holder whose channel is closed, -N for signal N; None where nobody can tell.
+
+        ``process`` is 0 for one that nobody has met.
+        """
         deadline = monotonic() + _OBITUARY_TIME
         reader = select.poll()
         reader.register(self._obituaries, select.POLLIN)
@@ -90,11 +93,8 @@ class HolderFamily:
                 break
             pid, status = OBITUARY.unpack(record)
             if pid == process:
-                code = os.waitstatus_to_exitcode(status)
-                if code >= 0:
-                    return f"ended with exit code {code}"
-                return f"died by {signal.Signals(-code).name}"
-        return "is gone"
+                return os.waitstatus_to_exitcode(status)
+        return None
 
     def close(self) -> None:
         """End all of them, at once and in a bounded time. Idempotent."""

@@ -39,6 +39,7 @@ from protocol.errors import (
     FatalSlaveError,
     SlaveCrashedError,
     SlaveError,
+    SlaveKilledError,
     StepRejectedError,
 )
 from protocol.signals import FloatArray
@@ -301,10 +302,14 @@ class ForkSlave(Slave):
         Raises:
             StepRejectedError: also then, if there is a saved state to go back to.
             FatalSlaveError: if there is none.
+            SlaveKilledError: its process was killed from outside, which says nothing of the step.
         """
         step = DoStep(communication_point, step_size, no_set_state_prior)
         try:
             return self._step(step)
+        except SlaveKilledError:
+            self._drop_active()
+            raise
         except (SlaveCrashedError, FatalSlaveError) as error:
             raise self._fallen(error) from None
 

@@ -7,6 +7,7 @@ from collections import deque
 
 from protocol.codec import decode_reply
 from protocol.errors import DoublestepError, SlaveCrashedError, SlaveError
+from slave_node.deaths import death
 from slave_node.states.channel import DURATION, PROCESS, Message
 from slave_node.states.fork_family import HolderFamily
 from slave_node.states.fork_trail import Task, Trail
@@ -108,9 +109,7 @@ class HeldProcess:
     def death(self) -> SlaveCrashedError:
         """The error that it is gone, and how it died; or its original, if it was never there."""
         dead = self if self._process or self._original is None else self._original
-        return SlaveCrashedError(
-            f"the process that held the model {self._family.death(dead._process)}"
-        )
+        return death(self._family.exit_code(dead._process))
 
     def close(self) -> None:
         """Let it end. Idempotent."""

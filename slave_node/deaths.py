@@ -1,0 +1,34 @@
+"""How a process that held a model died, as an error."""
+
+from __future__ import annotations
+
+import signal
+
+from protocol.errors import SlaveCrashedError, SlaveKilledError
+
+_FROM_OUTSIDE = frozenset(
+    getattr(signal, name)
+    for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT")
+    if hasattr(signal, name)
+)
+"""Signals that a model does not get by what it does."""
+
+
+def death(exit_code: int | None) -> SlaveCrashedError:
+    """The error to raise.
+
+    Args:
+        exit_code: as `multiprocessing.Process.exitcode`, -N for signal N; None: not known.
+
+    Returns:
+        `SlaveKilledError` where a signal from outside ended it, else `SlaveCrashedError`.
+    """
+    kind, how = SlaveCrashedError, "is gone"
+    if exit_code is not None and exit_code >= 0:
+        how = f"ended with exit code {exit_code}"
+    elif exit_code is not None:
+        number = signal.Signals(-exit_code)
+        how = f"died by {number.name}"
+        if number in _FROM_OUTSIDE:
+            kind = SlaveKilledError
+    return kind(f"the process that held the model {how}")
