@@ -74,6 +74,10 @@ def main(names: list[str]) -> None:
     if names and names[0] in CHECKS:
         CHECKS[names[0]](names[1:])
         return
+    unknown = [name for name in names if name not in TABLES]
+    if unknown:
+        known = ", ".join(sorted({*TABLES, *CHECKS}))
+        sys.exit(f"no benchmark is named {unknown[0]!r}; there are {known}")
     for name in names or TABLES:
         title, columns, run = TABLES[name]
         print(f"\n### {title}\n")

@@ -156,11 +156,11 @@ class Agent:
             )
         models = self._offer.store.models()
         self._bus.serve(self._key.status, lambda _: encode_record(self.status()))
-        self._bus.serve(self._key.verb(MODELS), self._answer_models)
-        self._serve(UPLOAD, Upload, self.upload)
-        self._serve(START, StartSlave, self.start)
-        self._serve(STOP, StopRun, self.stop)
-        self._serve(OUTPUT, OutputRequest, self.output)
+        self._serve(MODELS, lambda _: self.models())
+        self._serve_record(UPLOAD, Upload, self.upload)
+        self._serve_record(START, StartSlave, self.start)
+        self._serve_record(STOP, StopRun, self.stop)
+        self._serve_record(OUTPUT, OutputRequest, self.output)
         self._bus.watch(alive_master("*"), self._master_changed)
         self._bus.announce(self._key.alive)
         log.info("ready: agent with %d models, instance %s", len(models), self._key.instance)
@@ -178,21 +178,18 @@ class Agent:
         if self._offer.cache is not None:
             self._offer.cache.close()
 
-    def _serve(self, verb: str, cls: type[_R], handle: Callable[[_R], Record]) -> None:
+    def _serve(self, verb: str, handle: Callable[[bytes], Record]) -> None:
         def answer(data: bytes) -> bytes:
             try:
-                return encode_record(handle(decode_record(cls, data)))
+                return encode_record(handle(data))
             except DoublestepError as error:
                 log.warning("%s refused: %s", verb, error)
                 return encode_error_map(error)
 
         self._bus.serve(self._key.verb(verb), answer)
 
-    def _answer_models(self, _: bytes) -> bytes:
-        try:
-            return encode_record(self.models())
-        except DoublestepError as error:
-            return encode_error_map(error)
+    def _serve_record(self, verb: str, cls: type[_R], handle: Callable[[_R], Record]) -> None:
+        self._serve(verb, lambda data: handle(decode_record(cls, data)))
 
     def status(self) -> AgentStatus:
         """What it says of itself."""
@@ -257,26 +254,36 @@ class Agent:
             SlaveBusyError: the licence is taken; or the run has a slave of this name.
         """
         with self._lock:
-            run = self._runs.get(request.run)
-            started = run.slaves.get(request.slave) if run else None
-            if started is not None and started[0] == request:
-                return SlaveStarted(started[1].key.instance, started[1].pid)
-            is_again = started is not None and started[0].restart < request.restart
-            if (started is not None and not is_again) or (run is not None and run.ending):
-                raise SlaveBusyError(f"run {request.run} has ended, or has another such slave")
-            if started is not None:
-                end_all([started[1]], at_once=True)
-                self._forget(started[1])
-            self._check(request)
-            base, model = self._model(request.model)
-            process = self._process(model, base, request.slave, request.run)
-            self._runs.setdefault(request.run, _Run(request)).slaves[request.slave] = (
-                request,
-                process,
-            )
+            process = self._known(request)
+        if process is None:
+            base, model = self._model(request.model)  # may read large files: others are answered
+            with self._lock:
+                process = self._known(request) or self._start(request, base, model)
+        return SlaveStarted(process.key.instance, process.pid)
+
+    def _known(self, request: StartSlave) -> SlaveProcess | None:
+        """What was started at this very request."""
+        run = self._runs.get(request.run)
+        started = run.slaves.get(request.slave) if run else None
+        return started[1] if started is not None and started[0] == request else None
+
+    def _start(self, request: StartSlave, base: Path, model: str) -> SlaveProcess:
+        """Start a slave, in place of the one before if it is to be started again."""
+        run = self._runs.get(request.run) or _Run(request)
+        before = run.slaves.get(request.slave)
+        is_other = before is not None and before[0].restart >= request.restart
+        if run.ending or is_other:
+            raise SlaveBusyError(f"run {request.run} has ended, or has another such slave")
+        if before is not None:
+            end_all([before[1]], at_once=True)
+            self._forget(before[1])
+        self._check(request)
+        process = self._process(model, base, request.slave, request.run)
+        run.slaves[request.slave] = request, process
+        self._runs[request.run] = run
         log.info("started %s with %s for run %s", request.slave, request.model, request.run)
         self._look_after(request.run, request.orphan_time)  # its master may be gone already
-        return SlaveStarted(process.key.instance, process.pid)
+        return process
 
     def stop(self, request: StopRun) -> Done:
         """End all slaves of a run, in a bounded time."""
