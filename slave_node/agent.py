@@ -281,7 +281,13 @@ class Agent:
         process = self._process(model, base, request.slave, request.run)
         run.slaves[request.slave] = request, process
         self._runs[request.run] = run
-        log.info("started %s with %s for run %s", request.slave, request.model, request.run)
+        log.info(
+            "started %s with %s for run %s",
+            request.slave,
+            request.model,
+            request.run,
+            extra={"run": request.run, "slave": request.slave},
+        )
         self._look_after(request.run, request.orphan_time)  # its master may be gone already
         return process
 
@@ -408,7 +414,7 @@ class Agent:
             request = run.request
         if alive:
             return
-        log.warning("the master of run %s is gone", master.run)
+        log.warning("the master of run %s is gone", master.run, extra={"run": master.run})
         ended = has_ended(request.host, request.pid)
         self._look_after(master.run, 0.0 if ended else request.orphan_time)
 
@@ -433,7 +439,7 @@ class Agent:
                 return
         except SlaveLostError:  # the bus is closed: the agent is ending
             return
-        log.warning("run %s has no master any more: ending its slaves", run)
+        log.warning("run %s has no master any more: ending its slaves", run, extra={"run": run})
         self._end(run)
 
     def _end(self, run: str) -> None:
@@ -449,7 +455,8 @@ class Agent:
         with self._lock:
             self._runs.pop(run, None)
         for process in processes:
-            log.info("ended %s of run %s", process.key.name, run)
+            about = {"run": run, "slave": process.key.name}
+            log.info("ended %s of run %s", process.key.name, run, extra=about)
             self._forget(process)
 
     def _forget(self, process: SlaveProcess) -> None:

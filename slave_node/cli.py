@@ -55,6 +55,8 @@ Tls = Annotated[
     typer.Option(metavar="DIR", help="Certificates: encrypt, and let in only who has one."),
 ]
 
+LogStyle = Annotated[LogFormat, typer.Option(help="Of messages.")]
+
 BusMode = Annotated[
     Mode, typer.Option(help="peer: reach masters directly; client: through a router.")
 ]
@@ -85,7 +87,7 @@ def serve(  # noqa: PLR0917  options of the command line
     metrics_host: Annotated[
         str, typer.Option(help="Address for that; nobody is asked who he is.")
     ] = LOOPBACK,
-    log_format: Annotated[LogFormat, typer.Option(help="Of messages.")] = LogFormat.TEXT,
+    log_format: LogStyle = LogFormat.TEXT,
     fmi_logging: Annotated[
         bool, typer.Option("--fmi-logging", help="Let the FMU log all categories.")
     ] = False,
@@ -180,14 +182,13 @@ def router(
     connect: Annotated[list[str] | None, typer.Option(help="Another router.")] = None,
     insecure: Insecure = False,
     tls: Tls = None,
+    log_format: LogStyle = LogFormat.TEXT,
 ) -> None:
     """Connect masters and slaves in mode client with each other, until SIGTERM or Ctrl-C."""
     from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  each command imports what it needs
     from slave_node.router import serve_router  # noqa: PLC0415
 
-    logging.basicConfig(
-        level=logging.INFO, stream=sys.stderr, format="%(asctime)s router: %(message)s"
-    )
+    configure_logs(log_format, "%(asctime)s router: %(message)s")
     endpoints = Endpoints(
         listen=tuple(listen or (DEFAULT_ENDPOINT,)),
         connect=tuple(connect or ()),
@@ -290,6 +291,7 @@ def agent(  # noqa: PLR0917  options of the command line
     insecure: Insecure = False,
     tls: Tls = None,
     mode: BusMode = Mode.PEER,
+    log_format: LogStyle = LogFormat.TEXT,
 ) -> None:
     """Start slaves on this host when masters ask for them, until SIGTERM or Ctrl-C."""
     from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  each command imports what it needs
@@ -304,9 +306,7 @@ def agent(  # noqa: PLR0917  options of the command line
     from slave_node.upload_cache import UploadCache  # noqa: PLC0415
 
     key = AgentKey(check_name(name or socket.gethostname(), "agent name"), token_hex(4))
-    logging.basicConfig(
-        level=logging.INFO, stream=sys.stderr, format=f"%(asctime)s agent {key.name}: %(message)s"
-    )
+    configure_logs(log_format, f"%(asctime)s agent {key.name}: %(message)s")
     if logs is not None:
         _make_directory(logs)
     places = places_of(connect or (), listen or (), mode, insecure=insecure, tls=tls)

@@ -127,6 +127,25 @@ def test_master_and_slave_log_json(start: Start, tmp_path: Path, endpoint: str) 
     assert crashed["level"] == "error"
 
 
+@pytest.mark.skipif(os.name != "posix", reason="uses signals")
+def test_agent_and_router_log_json(start: Start, tmp_path: Path, endpoint: str) -> None:
+    """From their first line to their last."""
+    servers = [
+        start("slave_node", "router", "--listen", endpoint, "--log-format", "json"),
+        start(
+            *("slave_node", "agent", "--models", tmp_path, "--name", "bench-7"),
+            *("--mode", "client", "--connect", endpoint, "--log-format", "json"),
+        ),
+    ]
+    for server in servers:
+        server.wait_for("ready: ")
+    for server in reversed(servers):
+        server.process.terminate()
+        assert server.wait() == 0
+        messages = [json.loads(line)["message"] for line in server.text.splitlines()]
+        assert messages[-1] == "ended"
+
+
 # ---- Metrics -----------------------------------------------------------------------------------
 
 
