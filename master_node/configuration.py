@@ -511,6 +511,16 @@ class InputSettings(_Table):
             raise ValueError("must be a whole number")  # noqa: TRY004  pydantic wants ValueError
         return value
 
+    def file(self, base: Path) -> str | None:
+        """What it reads: a table, or a Python file with the function, relative to ``base``.
+
+        None where it comes out of a package or from Python, or is not there.
+        """
+        name: object = self.table
+        if isinstance(self.function, str):
+            name = self.function.rpartition(":")[0]
+        return name if isinstance(name, str) and (base / name).is_file() else None
+
     @field_serializer("table", "function")
     def _in_words(self, value: Any) -> str | None:
         """For ``summary.json``: files and functions by name."""

@@ -98,14 +98,8 @@ def _system(saved: Mapping[str, Any], base: Path) -> System:
 
 def _input_files(system: System) -> list[str]:
     """Tables, and Python files with functions, relative to the system's base."""
-    names = []
-    for value in system.inputs.values():
-        if isinstance(value, InputSettings):
-            if isinstance(value.table, str):
-                names.append(value.table)
-            if isinstance(value.function, str):
-                names.append(value.function.rpartition(":")[0])
-    return sorted({name for name in names if (system.base / name).is_file()})
+    settings = [value for value in system.inputs.values() if isinstance(value, InputSettings)]
+    return sorted({name for value in settings if (name := value.file(system.base))})
 
 
 def _sha256(path: Path) -> str:

@@ -171,13 +171,8 @@ class _Check:
 
 
 def _hashes_of_input_files(system: System) -> dict[str, str]:
-    hashes = {}
-    for name, setting in system.inputs.items():
-        if not isinstance(setting, InputSettings):
-            continue
-        file = setting.table or setting.function
-        if isinstance(file, str):
-            path = system.base / (file.rpartition(":")[0] if setting.function else file)
-            if path.is_file():  # a function may be in a package instead
-                hashes[name] = file_sha256(path)
-    return hashes
+    return {
+        name: file_sha256(system.base / file)
+        for name, value in system.inputs.items()
+        if isinstance(value, InputSettings) and (file := value.file(system.base))
+    }
