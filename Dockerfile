@@ -1,4 +1,3 @@
-# syntax=docker/dockerfile:1.9
 # One image for routers, slaves and masters. It holds no compiler and runs as nobody in particular.
 
 ARG PYTHON=python:3.12.8-slim-bookworm
