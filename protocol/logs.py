@@ -29,6 +29,9 @@ FIELDS = ("run", "slave", "request", "phase", "t", "H")
 name of the slave, ``epoch:sequence``, call, communication point [s], step size [s]."""
 
 
+_PACKAGES = ("protocol", "slave_node", "master_node")
+
+
 class JsonFormatter(logging.Formatter):
     """One JSON object on one line.
 
@@ -66,6 +69,8 @@ class JsonFormatter(logging.Formatter):
 def configure_logs(style: LogFormat, text_format: str, **known: object) -> None:
     """Write the log of this process to standard error, in place of what was configured before.
 
+    Of libraries warnings and errors only.
+
     Args:
         style: text or JSON.
         text_format: of `logging`, for text.
@@ -75,7 +80,9 @@ def configure_logs(style: LogFormat, text_format: str, **known: object) -> None:
     handler.setFormatter(
         JsonFormatter(known) if style is LogFormat.JSON else logging.Formatter(text_format)
     )
-    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    for package in _PACKAGES:
+        logging.getLogger(package).setLevel(logging.INFO)
 
 
 def add_log_fields(**fields: object) -> None:

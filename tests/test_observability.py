@@ -53,12 +53,14 @@ pytestmark = pytest.mark.usefixtures("no_process_left")
 
 @pytest.fixture
 def restored_logging() -> Iterator[None]:
-    """The root logger as it was."""
+    """The loggers as they were."""
     root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
+    loggers = [root, *map(logging.getLogger, ("protocol", "slave_node", "master_node"))]
+    handlers, levels = root.handlers[:], [logger.level for logger in loggers]
     yield
     root.handlers[:] = handlers
-    root.setLevel(level)
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)
 
 
 def test_a_json_line_says_where_it_belongs(
@@ -92,6 +94,18 @@ def test_text_is_as_it_was(restored_logging: None, capsys: pytest.CaptureFixture
     add_log_fields(run="0123abcd")
     logging.getLogger("master_node").info("hello", extra={"slave": "wheel"})
     assert capsys.readouterr().err == "INFO: hello\n"
+
+
+def test_libraries_are_heard_when_they_warn(
+    restored_logging: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What they do is not told, such as that a list of fonts was made."""
+    configure_logs(LogFormat.TEXT, "%(levelname)s: %(message)s")
+    for name in ("matplotlib.font_manager", "master_node", "slave_node.fmu", "protocol"):
+        logging.getLogger(name).info("of %s", name)
+    logging.getLogger("matplotlib.font_manager").warning("no font")
+    told = ["INFO: of master_node", "INFO: of slave_node.fmu", "INFO: of protocol"]
+    assert capsys.readouterr().err.splitlines() == [*told, "WARNING: no font"]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
