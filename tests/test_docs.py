@@ -192,6 +192,33 @@ def test_the_readme_names_every_option_of_a_run_and_no_other() -> None:
     assert set(re.findall(r"--[a-z-]+", " ".join(rows))) == known
 
 
+@pytest.mark.parametrize(
+    ("command", "document", "heading"),
+    [
+        ("serve", "docs/deployment.md", "## Options of `slave-node serve`"),
+        ("agent", "docs/agents.md", "## The command"),
+    ],
+)
+def test_a_table_has_every_option_of_its_command_and_no_other(
+    command: str, document: str, heading: str
+) -> None:
+    """The table of options and ``--help`` agree."""
+    (table,) = tables(section(read(document), heading))
+    known = set(re.findall(r"--[a-z-]+", help_of("slave-node", command))) - {"--help"}
+    assert set(re.findall(r"--[a-z-]+", " ".join(row[0] for row in table[1:]))) == known
+
+
+@pytest.mark.parametrize("program", APPS)
+def test_every_option_of_every_command_is_told_somewhere(program: str) -> None:
+    """In a document that names the command."""
+    texts = [path.read_text(encoding="utf-8") for path in DOCUMENTS]
+    for name in get_command(APPS[program]).commands:
+        told = " ".join(text for text in texts if f"{program} {name}" in text)
+        for option in re.findall(r"--[a-z-]+", help_of(program, name)):
+            if option != "--help":
+                assert re.search(rf"{option}(?![\w-])", told), f"{program} {name} {option}"
+
+
 def test_the_readme_gives_every_exit_code_a_meaning() -> None:
     """The table of exit codes and the error tree agree."""
     (table,) = [t for t in tables(read("README.md")) if t[0][0] == "exit code"]
@@ -259,6 +286,30 @@ def test_the_examples_in_the_document_of_system_files_are_valid() -> None:
     table = tomllib.loads(text)["slaves"]["wheel"]
     settings = System(slaves={"wheel": {"model": "wheel.fmu", **table}}).slaves["wheel"]
     assert settings.tolerances["v"] == OutputTolerance(absolute=1e-3, relative=1e-3)
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_tables_of_system_files_in_documents_are_valid(path: Path) -> None:
+    """Every block of TOML is a system file, a part of one, or a study."""
+    for text in blocks(path.read_text(encoding="utf-8"), "toml"):
+        given = tomllib.loads(text)
+        if "system" in given:
+            Study(**given)
+        else:
+            System(**{"slaves": {"any": {}}, **given})
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_what_documents_import_is_there(path: Path) -> None:
+    """Every block of Python can be read, and our names in it exist."""
+    for text in blocks(path.read_text(encoding="utf-8"), "python"):
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ImportFrom) and node.module in OUR_MODULES:
+                module = importlib.import_module(node.module)
+                assert [a.name for a in node.names if not hasattr(module, a.name)] == []
+
+
+OUR_MODULES = ("master_node", "slave_node.model")
 
 
 def test_a_slave_is_driven_by_hand_as_the_protocol_says(
