@@ -58,6 +58,7 @@ from protocol import codec, errors
 from protocol.calls import CALLS
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState
 from protocol.signals import MAX_ORDER
+from protocol.slave import Capabilities, SlaveDescription, Variable
 from slave_node.metrics import CountingWorker
 from slave_node.snapshots import LIMIT
 from tests.light_slaves import LightWorker
@@ -467,6 +468,18 @@ def test_the_verbs_and_their_fields_are_those_of_the_calls() -> None:
     assert [row[0] for row in table[1:]] == [f"`{call.verb}`" for call in CALLS]
     for row, call in zip(table[1:], CALLS, strict=True):
         assert re.findall(r"`(\w+)`", row[1]) == [field.name for field in fields(call)], row[0]
+
+
+def test_the_description_of_a_slave_is_that_of_the_program() -> None:
+    """Its fields, those of a variable, and the capabilities: every one, no other."""
+    described, capabilities = tables(
+        section(read("docs/protocol.md"), "### The description of a slave")
+    )
+    for table, cls in ((described, SlaveDescription), (capabilities, Capabilities)):
+        told = re.findall(r"`(\w+)`", " ".join(row[0] for row in table[1:]))
+        assert sorted(told) == sorted(field.name for field in fields(cls))
+    (variables,) = (row[2] for row in described if row[0] == "`variables`")
+    assert re.findall(r"`(\w+)`", variables) == [field.name for field in fields(Variable)]
 
 
 def test_the_life_cycle_is_the_table_of_the_program() -> None:
