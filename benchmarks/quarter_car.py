@@ -8,6 +8,10 @@ from master_node import System, load_system
 EXAMPLE = Path(__file__).parents[1] / "examples" / "quarter_car"
 
 
+ESTIMATORS = {"mod": "EST_mod", "rich": "EST_Rich"}
+"""The paper's names of the estimators."""
+
+
 def system(**simulation: Any) -> System:
     """Displacement-displacement coupling with EST_mod and k = 1, and what is given."""
     settings = {"estimator": "mod", "order": 1, "largest_step_size": 1e-2, **simulation}

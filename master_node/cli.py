@@ -407,7 +407,7 @@ def list_(
     tls: Tls = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show the slaves, agents, co-simulations and routers on the bus."""
+    """Show the slaves, agents, runs and routers on the bus."""
     from rich.console import Console  # noqa: PLC0415
 
     from master_node.listing import listing_data, listing_tables  # noqa: PLC0415

@@ -615,8 +615,11 @@ class System(_Table):
     Attributes:
         inputs: what drives inputs from outside, by ``slave.variable``; in Python also functions of
             the time, and tuples of times and values.
-        base: directory to which the models' paths are relative.
+        base: directory to which the models' paths are relative; default: the working directory.
         source: what to call this in messages: the file's name.
+
+    Raises:
+        ConfigurationError: a table is wrong; the message has a line for each mistake.
     """
 
     simulation: SimulationSettings = SimulationSettings()
@@ -730,13 +733,13 @@ class System(_Table):
         )
 
 
-def load_system(path: Path) -> System:
-    """Read a system file.
+def load_system(path: Path | str) -> System:
+    """Read a system file in TOML; `open_system` reads packages too.
 
     Raises:
         ConfigurationError: it is missing or wrong; the message has a line for each mistake.
     """
-    return System(**read_located_tables(path))
+    return System(**read_located_tables(Path(path)))
 
 
 def configuration_error(

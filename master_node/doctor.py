@@ -58,7 +58,7 @@ class Diagnosis:
             ways.add_row(window.endpoint, plain(result if failure is None else failure.cause))
         there = Table(title="Participants", title_justify="left")
         for column in ("name", "host / pid", "answers", "round trip", "clock", "state"):
-            there.add_column(column, no_wrap=True)
+            there.add_column(column, overflow="fold")
         for participant, timing in self.timings:
             status = participant.status
             there.add_row(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import datetime
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from master_node.plain_text import plain
 from master_node.survey import Participant
@@ -16,11 +16,11 @@ from protocol.keys import AgentKey, MasterKey, SlaveKey
 
 
 def listing_tables(participants: Sequence[Participant]) -> list[Table]:
-    """Slaves, agents, co-simulations and routers; no table for what there is none of."""
+    """Slaves, agents, runs and routers; no table for what there is none of."""
     slaves = _table("Slaves", "name", "host", "model", "kind", "capabilities", "state", "since")
     columns = ("name", "host", "labels", "licences free", "models", "slaves", "since")
     agents = _table("Agents", *columns)
-    runs = _table("Co-simulations", "run", "host", "system", "slaves", "since")
+    runs = _table("Runs", "run", "host", "system", "slaves", "since")
     routers = _table("Routers", "host", "addresses", "since")
     silent = _table("No answer", "key", "cause")
     for participant in participants:
@@ -44,7 +44,7 @@ def listing_tables(participants: Sequence[Participant]) -> list[Table]:
 def listing_data(participants: Sequence[Participant]) -> dict[str, list[dict[str, object]]]:
     """The same as plain data, with times in seconds since 1970."""
     data: dict[str, list[dict[str, object]]] = {
-        kind: [] for kind in ("slaves", "agents", "co_simulations", "routers", "silent")
+        kind: [] for kind in ("slaves", "agents", "runs", "routers", "silent")
     }
     for participant in participants:
         if participant.status is None:
@@ -54,7 +54,7 @@ def listing_data(participants: Sequence[Participant]) -> dict[str, list[dict[str
         elif isinstance(participant.key, AgentKey):
             data["agents"].append(asdict(participant.status))
         elif isinstance(participant.key, MasterKey):
-            data["co_simulations"].append(asdict(participant.status))
+            data["runs"].append(asdict(participant.status))
         else:
             data["routers"].append(asdict(participant.status))
     return data
@@ -75,7 +75,9 @@ def _agent_cells(agent: AgentStatus) -> tuple[object, ...]:
 
 
 def _table(title: str, *columns: str) -> Table:
-    return Table(*columns, title=title, title_justify="left")
+    """Whole at any width: a name or a number that is cut off may be another's."""
+    cells = (Column(name, overflow="fold") for name in columns)
+    return Table(*cells, title=title, title_justify="left")
 
 
 def _add(table: Table, *cells: object) -> None:

@@ -128,7 +128,7 @@ def _title(result: Result, variables: int, shown: int) -> str:
     rejected = int(np.count_nonzero(~result.steps["accepted"]))
     parts = [
         str(result.summary.get("outcome", "run without an end")),
-        f"{len(result.time)} points in time",
+        f"{len(result.time)} result points",
         f"{rejected} of {len(result.steps)} attempts rejected",
     ]
     if shown < variables:

@@ -16,7 +16,7 @@ from rich.progress import (
     TimeRemainingColumn,
     TransferSpeedColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from master_node.agent_models import Sent
@@ -222,7 +222,8 @@ def summary_table(result_summary: Mapping[str, Any]) -> Table:
     per_slave = [(result_summary.get(key) or {}, label) for key, label in _PER_SLAVE]
     names = dict.fromkeys(name for values, _ in per_slave for name in values)
     if names:
-        slaves = Table("slave", box=None, padding=(0, 2, 0, 0), header_style="dim")
+        first = Column("slave", overflow="fold")
+        slaves = Table(first, box=None, padding=(0, 2, 0, 0), header_style="dim")
         for _, label in per_slave:
             slaves.add_column(Text(label), justify="right")
         for name in names:

@@ -63,7 +63,8 @@ def simulate(
         launch: start slaves that have a model; False: find all of them on the bus.
         observers: are told of everything that happens.
         trace: file for a trace of all requests, see ``docs/observability.md``; None: none.
-        **simulation: settings that override ``system.simulation``, such as ``stop_time=4.0``.
+        **simulation: settings that override ``system.simulation``, such as ``stop_time=4.0``; None
+            leaves one as it is.
 
     Raises:
         DoublestepError: see ``protocol/errors.py``; the result files hold what was accepted.

@@ -48,7 +48,7 @@ class ImportedSystem:
 
 
 @contextmanager
-def open_system(path: Path) -> Iterator[System]:
+def open_system(path: Path | str) -> Iterator[System]:
     """The system in a ``.toml``, ``.ssp`` or ``.ssd`` file.
 
     The models of a package are extracted into a temporary directory, which is removed at the end:
@@ -57,6 +57,7 @@ def open_system(path: Path) -> Iterator[System]:
     Raises:
         ConfigurationError: the file is missing or wrong, or holds what is not supported.
     """
+    path = Path(path)
     if path.suffix.lower() not in _SSP_SUFFIXES:
         yield load_system(path)
         return

@@ -18,7 +18,7 @@
     │   ├── VersionError         different protocol versions                              exit 6
     │   ├── LifeCycleError       a call that the slave's state does not allow             exit 6
     │   ├── SequenceError        a stale epoch or a sequence number out of order          exit 6
-    │   └── SlaveBusyError       the slave is held by another master                      exit 6
+    │   └── SlaveBusyError       the slave, or a licence, is held by another master       exit 6
     ├── ResultsError             results cannot be written or read                        exit 7
     └── InterruptedRunError      Ctrl-C or SIGTERM ended the run                          exit 130
 """
@@ -119,7 +119,7 @@ class DoublestepError(Exception):
 
 
 class ConfigurationError(DoublestepError):
-    """The system file, the command line or a model's use is wrong. Nothing was started."""
+    """The system file, the command line or a model's use is wrong. No step was taken."""
 
     exit_code = 2
 
@@ -191,7 +191,7 @@ class SequenceError(ProtocolError):
 
 
 class SlaveBusyError(ProtocolError):
-    """The slave is held by another master."""
+    """The slave is held by another master, or all licences for it are taken."""
 
 
 class ResultsError(DoublestepError):

@@ -284,8 +284,8 @@ class Examination:
 class Slave(ABC):
     """One co-simulation slave, in the process that holds it. Not thread-safe.
 
-    Call order: ``life_cycle.py``. Any method may raise `SlaveError`; after a `StepRejectedError`
-    or a discarded step only ``set_state``, ``reset`` and ``terminate`` are meaningful.
+    Call order: ``life_cycle.py``, also for what is left after an error (state *error*) and after a
+    step that was not completed (*step failed*). Any method may raise `SlaveError`.
     Saved states are opaque to the caller; what ``get_state`` returned stays valid until it is
     passed to ``free_state`` or the slave is reset, and may be restored any number of times.
 

@@ -15,6 +15,7 @@ import tomllib
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
+from enum import StrEnum
 from pathlib import Path
 from secrets import token_hex
 from types import FrameType
@@ -57,8 +58,16 @@ Tls = Annotated[
 
 LogStyle = Annotated[LogFormat, typer.Option(help="Of messages.")]
 
-BusMode = Annotated[
-    Mode, typer.Option(help="peer: reach masters directly; client: through a router.")
+
+class BusMode(StrEnum):
+    """How a slave or an agent takes part in the bus; a router is a command of its own."""
+
+    PEER = Mode.PEER
+    CLIENT = Mode.CLIENT
+
+
+BusModeOption = Annotated[
+    BusMode, typer.Option("--mode", help="peer: reach masters directly; client: through a router.")
 ]
 
 
@@ -80,7 +89,7 @@ def serve(  # noqa: PLR0917  options of the command line
     ] = None,
     insecure: Insecure = False,
     tls: Tls = None,
-    mode: BusMode = Mode.PEER,
+    mode: BusModeOption = BusMode.PEER,
     metrics_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Serve metrics for Prometheus there.")
     ] = None,
@@ -116,7 +125,7 @@ def serve(  # noqa: PLR0917  options of the command line
         listen=tuple(listen or ()),
         connect=tuple(connect or (() if listen else (DEFAULT_ENDPOINT,))),
         insecure=insecure,
-        mode=mode,
+        mode=Mode(mode),
         credentials=None if tls is None else Credentials(tls.absolute(), Role.SLAVE),
     )
     reference = ModelReference(
@@ -290,7 +299,7 @@ def agent(  # noqa: PLR0917  options of the command line
     ] = None,
     insecure: Insecure = False,
     tls: Tls = None,
-    mode: BusMode = Mode.PEER,
+    mode: BusModeOption = BusMode.PEER,
     log_format: LogStyle = LogFormat.TEXT,
 ) -> None:
     """Start slaves on this host when masters ask for them, until SIGTERM or Ctrl-C."""
@@ -309,7 +318,7 @@ def agent(  # noqa: PLR0917  options of the command line
     configure_logs(log_format, f"%(asctime)s agent {key.name}: %(message)s")
     if logs is not None:
         _make_directory(logs)
-    places = places_of(connect or (), listen or (), mode, insecure=insecure, tls=tls)
+    places = places_of(connect or (), listen or (), Mode(mode), insecure=insecure, tls=tls)
     offer = Offer(
         labels=parse_labels(label or ()),
         licences=parse_licences(licence or ()),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rich.box import SIMPLE_HEAD
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from protocol.slave import SlaveDescription
@@ -26,7 +26,10 @@ _INPUTS = {
 
 
 def description_tables(description: SlaveDescription) -> list[Table]:
-    """The model, its variables and its capabilities as tables."""
+    """The model, its variables and its capabilities as tables.
+
+    Names and hashes are whole at any width, as they are what a system file wants.
+    """
     return [_model(description), _variables(description)]
 
 
@@ -45,7 +48,8 @@ _STYLES = {Grade.OK: "green", Grade.NOTE: "yellow", Grade.PROBLEM: "bold red"}
 
 
 def _model(description: SlaveDescription) -> Table:
-    table = Table(title=Text(description.model), show_header=False, title_justify="left")
+    columns = (Column(overflow="fold"), Column(overflow="fold"))
+    table = Table(*columns, title=Text(description.model), show_header=False, title_justify="left")
     can = description.capabilities
     rows = {
         "kind": description.kind,
@@ -81,7 +85,8 @@ def _state(description: SlaveDescription) -> str:
 
 def _variables(description: SlaveDescription) -> Table:
     table = Table(title="Variables", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for column in ("name", "causality", "variability", "type", "unit"):
+    table.add_column("name", overflow="fold", min_width=8)
+    for column in ("causality", "variability", "type", "unit"):
         table.add_column(column, no_wrap=True)
     table.add_column("start", no_wrap=True, justify="right")
     table.add_column("nominal", no_wrap=True, justify="right")

@@ -58,6 +58,7 @@ from protocol import codec, errors
 from protocol.calls import CALLS
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState
 from protocol.signals import MAX_ORDER
+from protocol.slave import Capabilities, SlaveDescription, Variable
 from slave_node.metrics import CountingWorker
 from slave_node.snapshots import LIMIT
 from tests.light_slaves import LightWorker
@@ -192,6 +193,33 @@ def test_the_readme_names_every_option_of_a_run_and_no_other() -> None:
     assert set(re.findall(r"--[a-z-]+", " ".join(rows))) == known
 
 
+@pytest.mark.parametrize(
+    ("command", "document", "heading"),
+    [
+        ("serve", "docs/deployment.md", "## Options of `slave-node serve`"),
+        ("agent", "docs/agents.md", "## The command"),
+    ],
+)
+def test_a_table_has_every_option_of_its_command_and_no_other(
+    command: str, document: str, heading: str
+) -> None:
+    """The table of options and ``--help`` agree."""
+    (table,) = tables(section(read(document), heading))
+    known = set(re.findall(r"--[a-z-]+", help_of("slave-node", command))) - {"--help"}
+    assert set(re.findall(r"--[a-z-]+", " ".join(row[0] for row in table[1:]))) == known
+
+
+@pytest.mark.parametrize("program", APPS)
+def test_every_option_of_every_command_is_told_somewhere(program: str) -> None:
+    """In a document that names the command."""
+    texts = [path.read_text(encoding="utf-8") for path in DOCUMENTS]
+    for name in get_command(APPS[program]).commands:
+        told = " ".join(text for text in texts if f"{program} {name}" in text)
+        for option in re.findall(r"--[a-z-]+", help_of(program, name)):
+            if option != "--help":
+                assert re.search(rf"{option}(?![\w-])", told), f"{program} {name} {option}"
+
+
 def test_the_readme_gives_every_exit_code_a_meaning() -> None:
     """The table of exit codes and the error tree agree."""
     (table,) = [t for t in tables(read("README.md")) if t[0][0] == "exit code"]
@@ -259,6 +287,30 @@ def test_the_examples_in_the_document_of_system_files_are_valid() -> None:
     table = tomllib.loads(text)["slaves"]["wheel"]
     settings = System(slaves={"wheel": {"model": "wheel.fmu", **table}}).slaves["wheel"]
     assert settings.tolerances["v"] == OutputTolerance(absolute=1e-3, relative=1e-3)
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_tables_of_system_files_in_documents_are_valid(path: Path) -> None:
+    """Every block of TOML is a system file, a part of one, or a study."""
+    for text in blocks(path.read_text(encoding="utf-8"), "toml"):
+        given = tomllib.loads(text)
+        if "system" in given:
+            Study(**given)
+        else:
+            System(**{"slaves": {"any": {}}, **given})
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_what_documents_import_is_there(path: Path) -> None:
+    """Every block of Python can be read, and our names in it exist."""
+    for text in blocks(path.read_text(encoding="utf-8"), "python"):
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ImportFrom) and node.module in OUR_MODULES:
+                module = importlib.import_module(node.module)
+                assert [a.name for a in node.names if not hasattr(module, a.name)] == []
+
+
+OUR_MODULES = ("master_node", "slave_node.model")
 
 
 def test_a_slave_is_driven_by_hand_as_the_protocol_says(
@@ -416,6 +468,18 @@ def test_the_verbs_and_their_fields_are_those_of_the_calls() -> None:
     assert [row[0] for row in table[1:]] == [f"`{call.verb}`" for call in CALLS]
     for row, call in zip(table[1:], CALLS, strict=True):
         assert re.findall(r"`(\w+)`", row[1]) == [field.name for field in fields(call)], row[0]
+
+
+def test_the_description_of_a_slave_is_that_of_the_program() -> None:
+    """Its fields, those of a variable, and the capabilities: every one, no other."""
+    described, capabilities = tables(
+        section(read("docs/protocol.md"), "### The description of a slave")
+    )
+    for table, cls in ((described, SlaveDescription), (capabilities, Capabilities)):
+        told = re.findall(r"`(\w+)`", " ".join(row[0] for row in table[1:]))
+        assert sorted(told) == sorted(field.name for field in fields(cls))
+    (variables,) = (row[2] for row in described if row[0] == "`variables`")
+    assert re.findall(r"`(\w+)`", variables) == [field.name for field in fields(Variable)]
 
 
 def test_the_life_cycle_is_the_table_of_the_program() -> None:

@@ -555,7 +555,7 @@ def test_repr_is_for_people() -> None:
     recording = Recording()
     drive(recording)
     text = repr(recording.result())
-    assert "completed: 5 communication points from 0 to 0.75 s, 3 attempts, 1 rejected" in text
+    assert "completed: 5 result points from 0 to 0.75 s, 3 attempts, 1 rejected" in text
     assert "wheel.v [m/s], chassis.x [m], chassis.v>" in text
 
 

@@ -18,11 +18,13 @@ from typing import Any
 import msgpack
 import psutil
 import pytest
+from typer.testing import CliRunner
 
 from protocol.codec import decode_map
 from protocol.endpoints import Endpoints
 from protocol.keys import STATUS, SlaveKey
 from protocol.zenoh_bus import ZenohBus
+from slave_node.cli import app
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="uses named pipes and signals"),
@@ -351,6 +353,14 @@ def test_a_wrong_option_is_one_line(
     node = start(fmu_dir / "wheel.fmu", *arguments)
     assert message in failure(node)
     assert len(node.log) == 1
+
+
+@pytest.mark.parametrize("command", [("serve", "wheel.fmu"), ("agent", "--models", ".")])
+def test_slaves_and_agents_are_no_routers(command: tuple[str, ...]) -> None:
+    """Their modes are those of the documents: a router is a command of its own."""
+    refused = CliRunner().invoke(app, [*command, "--mode", "router"])
+    assert refused.exit_code == 2
+    assert "'router' is not one of 'peer', 'client'" in refused.output
 
 
 def test_a_port_in_use_is_named(

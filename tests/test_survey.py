@@ -13,6 +13,7 @@ from typing import Any
 
 import msgpack
 import pytest
+from rich.console import Console
 
 from master_node.doctor import diagnose
 from master_node.listing import listing_data, listing_tables
@@ -135,6 +136,26 @@ def test_what_a_slave_says_does_nothing_to_the_terminal() -> None:
     assert not cell.spans
 
 
+def test_nothing_is_cut_off_in_a_narrow_terminal() -> None:
+    """Names, process ids and addresses go on in the next line: half of one may be another's."""
+    bus = InProcessBus()
+    long = "a" * 90
+    serve(bus, slave_status(long, pid=4194303))
+    key = RouterKey("r" * 30)
+    router = RouterStatus(key.instance, "host", 4194303, f"at tcp/{long}:7447", 0.0, time.time())
+    bus.serve(key.status, lambda _: encode_map(router.to_message()))
+    bus.announce(key.alive)
+    console = Console(width=80, color_system=None)
+    for tables in (
+        listing_tables(survey([bus])),
+        diagnose([Window("here", False, bus)]).tables(),
+    ):
+        with console.capture() as captured:
+            console.print(*tables)
+        assert "…" not in captured.get()
+        assert captured.get().count("a") > 2 * len(long)
+
+
 # ---- What is wrong ------------------------------------------------------------------------------
 
 
@@ -203,7 +224,7 @@ def test_list_and_doctor_through_a_router(start: Commands, tmp_path: Path, endpo
     data = json.loads(listed.text)
     slaves = {row["name"]: row for row in data["slaves"]}
     assert slaves.keys() == {"spare", "wheel", "chassis"}
-    (run,) = data["co_simulations"]
+    (run,) = data["runs"]
     (router,) = data["routers"]
     assert (run["system"], run["pid"]) == (str(file), master.process.pid)
     assert router["endpoints"] == f"at {endpoint}"

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from protocol.slave import CallExecutor, SlaveDescription
-from slave_node.inspection import report_table
+from protocol.slave import CallExecutor, SlaveDescription, Variable
+from slave_node.inspection import description_tables, report_table
 from slave_node.loading import load_executor
 from slave_node.validation import Finding, Grade, validate
 from slave_node.worker import ModelReference, WorkerProcess, execute_program
@@ -52,6 +52,25 @@ class LocalWorker:
         if self._scratch is not None:
             self._scratch.cleanup()
         self._executor = self._scratch = None
+
+
+def test_nothing_of_a_description_is_cut_off_in_a_narrow_terminal() -> None:
+    """Names and hashes are what a system file wants: they go on in the next line."""
+    name = ".".join(["component"] * 9)
+    description = SlaveDescription(
+        model="Model",
+        kind="FMI 2.0 co-simulation",
+        variables=(Variable(name, unit="N.m/rad", start=1.0, nominal=2.0, description="angle"),),
+        sha256="7" * 64,
+        guid="{" + "8" * 64 + "}",
+    )
+    console = Console(width=80, color_system=None)
+    with console.capture() as captured:
+        console.print(*description_tables(description))
+    shown = captured.get()
+    assert "…" not in shown
+    assert (shown.count("7"), shown.count("8")) == (64, 64)
+    assert "N.m/rad" in shown
 
 
 # ---- What is true of each FMU -------------------------------------------------------------------

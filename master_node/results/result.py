@@ -39,10 +39,11 @@ class Result:
     Attributes:
         names: ``slave.variable`` of the m outputs.
         units: of each name and of the discrete variables, "" where none is known.
-        time: the n communication points [s], shape (n,).
+        time: the n result points [s], shape (n,).
         outputs: row i is y at ``time[i]``, shape (n, m); column j belongs to ``names[j]``.
         steps: the attempts, accepted or not; structured array of ``STEPS_DTYPE``.
-        summary: as in ``summary.json``; empty when the run did not get to its end.
+        summary: as in ``summary.json``; empty while there is none: until the run has ended, in
+            whatever way, and after the master was killed.
         discrete: the discrete variables by name, shape (n,) each: float64, int64, bool, or objects
             that are str or bytes.
     """
@@ -96,7 +97,7 @@ class Result:
         span = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""
         return (
             f"<Result {self.summary.get('outcome', 'without an end')}: "
-            f"{len(self.time)} communication points{span}, "
+            f"{len(self.time)} result points{span}, "
             f"{len(self.steps)} attempts, {rejected} rejected\n"
             f"  {', '.join(shown[:8])}{more}>"
         )
