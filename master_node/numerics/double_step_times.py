@@ -13,7 +13,9 @@ class DoubleStepTimes(NamedTuple):
 
     Attributes:
         begin, middle, end: communication points [s].
-        first, second: sizes of the small steps [s]; both are H but for rounding.
+        first, second: sizes of the small steps [s]; both are H but for the rounding of the times.
+            They are the differences of the times, so that slaves get neither ahead of the time nor
+            behind it, however far apart neighbouring numbers are.
     """
 
     begin: float
@@ -28,6 +30,5 @@ class DoubleStepTimes(NamedTuple):
     ) -> DoubleStepTimes:
         """Two steps of H [s]; with ``stop_time`` the second ends exactly there."""
         middle = begin + step_size
-        if stop_time is None:
-            return DoubleStepTimes(begin, middle, middle + step_size, step_size, step_size)
-        return DoubleStepTimes(begin, middle, stop_time, step_size, stop_time - middle)
+        end = middle + step_size if stop_time is None else stop_time
+        return DoubleStepTimes(begin, middle, end, middle - begin, end - middle)
