@@ -243,6 +243,44 @@ def test_slaves_keep_up_with_the_time(rollback: bool) -> None:
     assert np.abs(states - exact).max() < 1e-5
 
 
+class OnTime(LinearSlave):
+    """Knows its time, also after it was set back, and refuses a step that begins elsewhere."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self.time = 0.0
+        self.times: list[tuple[object, float]] = []
+        super().__init__(*arguments)
+
+    def do_step(self, communication_point: float, step_size: float, prior: bool) -> StepResult:
+        """See `Slave`."""
+        assert communication_point == pytest.approx(self.time, rel=1e-14)
+        self.time = communication_point + step_size
+        return super().do_step(communication_point, step_size, prior)
+
+    def get_state(self) -> object:
+        """See `Slave`."""
+        state = super().get_state()
+        self.times.append((state, self.time))
+        return state
+
+    def set_state(self, state: object) -> None:
+        """See `Slave`."""
+        super().set_state(state)
+        self.time = next(time for kept, time in self.times if kept is state)
+
+
+@pytest.mark.parametrize("estimator", ["mod", "rich"])
+@pytest.mark.parametrize("sequence", ["jacobi", "gauss-seidel"])
+def test_every_do_step_begins_where_its_slave_stands(estimator: str, sequence: str) -> None:
+    """Law: after accepted, rejected and compared steps T is the time of the slave's state."""
+    slaves = {"chassis": OnTime(CHASSIS, np.zeros(2)), "wheel": OnTime(WHEEL, np.zeros(2))}
+    system = car(estimator=estimator, sequence=sequence, stop_time=0.1, initial_step_size=0.02)
+    found = run_slaves(system, slaves)
+    assert found.error is None, found.error
+    assert found.result.summary["rejected_double_steps"] > 0
+    assert {slave.time for slave in slaves.values()} == {0.1}
+
+
 @pytest.mark.parametrize("controller", ["elementary", "pi"])
 def test_a_fine_grid_makes_no_difference_to_the_control(controller: str) -> None:
     """Law: where H is a multiple of a microsecond it follows the error as it does without a grid.
