@@ -311,7 +311,7 @@ class ControlledRun:
         _, following, controller = self._controller.decide(
             times.first, error.norm, self._control.exponent(polynomials), position.controller
         )
-        if times.first < position.step_size:  # cut short by a target or a bracket
+        if self._limits.is_cut_short(times, position.step_size):  # by a target or a bracket
             following = max(following, position.step_size)
         memory = position.order
         if self._orders is not None:

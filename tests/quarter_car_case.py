@@ -20,7 +20,7 @@ from master_node import Result, System
 from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.coupling_scheme import CouplingScheme
 from master_node.double_step import DoubleStep, DoubleStepper
-from master_node.error_control import ErrorControl
+from master_node.error_control import ErrorControl, StepError
 from master_node.initialization import initialize
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import ESTIMATORS
@@ -375,9 +375,14 @@ class LocalError:
     """A double step from the exact solution with an exact history, shape (m,) each."""
 
     names: tuple[str, ...]
-    estimate: np.ndarray
+    judged: StepError
     error: np.ndarray
     step: DoubleStep
+
+    @property
+    def estimate(self) -> np.ndarray:
+        """EST."""
+        return self.judged.estimate
 
     def deviation(self, *names: str) -> float:
         """How far the estimates of some outputs are from the true errors, relative to these.
@@ -441,7 +446,7 @@ def local_error(
     assert isinstance(step, DoubleStep), step
     control = ErrorControl(coupled, scheme, estimator, system.simulation.constants)
     exact = exact_outputs(coupled.output_names, times.end)[0]
-    return LocalError(coupled.output_names, control.judge(step).estimate, step.end[0] - exact, step)
+    return LocalError(coupled.output_names, control.judge(step), step.end[0] - exact, step)
 
 
 SIZES = {0: (0.4e-3, 0.2e-3), 1: (0.4e-3, 0.2e-3), 2: (0.4e-3, 0.2e-3), 3: (0.5e-3, 0.25e-3)}

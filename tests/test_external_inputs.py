@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from master_node import InputSettings, Result, System, load_system, simulate
+from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.input_tables import InputTableError, TableGroup, make_table
 from master_node.numerics.landing_points import LandingPoints
 from master_node.numerics.step_polynomials import Quadrature, step_polynomial
@@ -133,13 +134,15 @@ def test_a_polynomial_up_to_its_degree_stands_for_itself(
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
-def test_mean_and_first_moment_are_kept_over_a_jump(degree: int) -> None:
+@pytest.mark.parametrize("step_size", [1.0, 0.02])
+def test_mean_and_first_moment_are_kept_over_a_jump(degree: int, step_size: float) -> None:
     """Law: the impulse has its size, and with degree 3 its place, wherever the jump is."""
-    quadrature = Quadrature.over(2.0, np.array([2.3]), 3.0)
-    values = (quadrature.times > 2.3).astype(float)
+    jump = 2.0 + 0.3 * step_size
+    quadrature = Quadrature.over(2.0, np.array([jump]), 2.0 + step_size)
+    values = (quadrature.times > jump).astype(float)
     mean, moment = (np.array([(w * values).sum()]) for w in (quadrature.mean, quadrature.moment))
-    rows = step_polynomial(np.zeros(1), np.ones(1), (mean, moment), 1.0, degree)
-    fine = Quadrature.over(0.0, np.linspace(0.0, 1.0, 50)[1:-1], 1.0)
+    rows = step_polynomial(np.zeros(1), np.ones(1), (mean, moment), step_size, degree)
+    fine = Quadrature.over(0.0, step_size * np.linspace(0.0, 1.0, 50)[1:-1], step_size)
     u = np.array([[InputSignal(rows).at(float(t))[0] for t in line] for line in fine.times])
     assert (fine.mean * u).sum() == pytest.approx(0.7)
     if degree == 3:
@@ -208,6 +211,22 @@ def test_double_steps_end_on_the_last_point_in_reach() -> None:
     assert points.target(0.9, 0.2, 1.1, first=False) == 1.0
     assert points.target(0.9999, 0.05, 9.0, first=False) == 9.0
     assert points.target(2.0, 5.0, 3.0005, first=False) == 3.0005
+
+
+def test_a_point_inside_a_double_step_is_the_first_that_it_could_end_on() -> None:
+    """Neither one at its end nor one nearer than the smallest H allows; none behind the last."""
+    points = LandingPoints([1.0, 1.2, 1.4], 1e-3)
+
+    def inside(begin: float, step_size: float) -> float | None:
+        return points.inside(DoubleStepTimes.from_step_size(begin, step_size))
+
+    assert inside(0.5, 0.4) == 1.0
+    assert inside(0.5, 0.25) is None, "it ends there"
+    assert inside(0.999, 0.15) == 1.2, "1.0 is too near"
+    assert inside(1.0, 0.05) is None
+    assert inside(1.3, 0.5) == 1.4
+    assert inside(1.4, 0.5) is None
+    assert inside(2.0, 0.5) is None
 
 
 # ---- What drives a slave ------------------------------------------------------------------------

@@ -49,6 +49,37 @@ def test_the_estimate_tends_to_the_true_error(
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize(
+    ("constants", "sequence"),
+    [("exact", "jacobi"), ("exact", "gauss-seidel"), ("paper", "jacobi")],
+)
+@pytest.mark.parametrize("coupling", ["displacement", "force"])
+def test_err_is_the_norm_of_the_estimate(
+    estimator: str, constants: str, sequence: str, coupling: str
+) -> None:
+    """Law: ERR is equation (8) of EST, and names the output that has most of it.
+
+    Where all outputs have one constant p, and where each has its own.
+    """
+    system: dict[str, Any] = (
+        {"parts": FORCE_PARTS, "connections": FORCE} if coupling == "force" else {}
+    )
+    found = local_error(
+        InputPolynomial(1),
+        1e-3,
+        estimator=estimator,
+        constants=constants,
+        sequence=sequence,
+        absolute_tolerance=1e-5,
+        relative_tolerance=1e-3,
+        **system,
+    )
+    parts = found.estimate / (1e-5 + 1e-3 * np.abs(found.step.end[0]))
+    assert found.judged.norm == pytest.approx(np.sqrt(np.mean(parts**2)), rel=1e-12)
+    assert found.judged.limiting_variable == found.names[int(np.abs(parts).argmax())]
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("polynomial", VALUES_ONLY, ids=str)
 def test_the_constants_of_the_paper_are_those_of_steps_of_one_size(
     estimator: str, polynomial: InputPolynomial

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -20,8 +21,18 @@ from master_node.numerics.step_size_limits import (
 from master_node.step_size_rules import check_step_sizes
 from protocol.calls import StepResult
 from protocol.errors import ConfigurationError, StepSizeError
-from protocol.slave import Capabilities, Slave
-from tests.quarter_car_case import ALL, CHASSIS, DISPLACEMENT, WHEEL, LinearSlave, run_slaves
+from protocol.slave import Capabilities, Slave, StateKind
+from tests.quarter_car_case import (
+    ALL,
+    CHASSIS,
+    DISPLACEMENT,
+    STATES,
+    WHEEL,
+    LinearSlave,
+    car,
+    exact_solution,
+    run_slaves,
+)
 
 STOP = 0.24
 Rules = Mapping[str, float]
@@ -203,6 +214,92 @@ def test_time_goes_on_where_numbers_are_far_apart(estimator: str) -> None:
     limits = {"initial_step_size": 1e-7, "largest_step_size": 1e-7}
     with pytest.raises(ConfigurationError, match=r"the numbers near t=1000000000\.5 s"):
         check_step_sizes(System(simulation={**span, **limits}, slaves={"chassis": {}}))
+
+
+@pytest.mark.parametrize("rollback", [True, False])
+def test_slaves_keep_up_with_the_time(rollback: bool) -> None:
+    """Law: of an autonomous system it makes no difference when it starts.
+
+    At 1.7e9 s, today in seconds since 1970, neighbouring numbers are 0.24 µs apart. T + H is
+    rounded to one of them, the same way in step after step of the same H, and slaves that took H
+    itself would get ahead of the time: the states would be wrong by 1e-2.
+    """
+    slaves = {"chassis": CHASSIS.slave(), "wheel": WHEEL.slave()}
+    if not rollback:
+        for slave in slaves.values():
+            slave.description = replace(slave.description, state_kind=StateKind.NONE)
+    system = car(
+        start_time=1.7e9,
+        stop_time=1.7e9 + 0.25,
+        initial_step_size=1.01e-4,
+        largest_step_size=1.01e-4,
+        relative_tolerance=0.1,
+        absolute_tolerance=0.1,
+    )
+    found = run_slaves(system, slaves)
+    assert found.error is None
+    states = np.stack([found.result[name] for name in STATES], axis=1)
+    exact = exact_solution(found.result.time - 1.7e9)
+    assert np.abs(states - exact).max() < 1e-5
+
+
+class OnTime(LinearSlave):
+    """Knows its time, also after it was set back, and refuses a step that begins elsewhere."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self.time = 0.0
+        self.times: list[tuple[object, float]] = []
+        super().__init__(*arguments)
+
+    def do_step(self, communication_point: float, step_size: float, prior: bool) -> StepResult:
+        """See `Slave`."""
+        assert communication_point == pytest.approx(self.time, rel=1e-14)
+        self.time = communication_point + step_size
+        return super().do_step(communication_point, step_size, prior)
+
+    def get_state(self) -> object:
+        """See `Slave`."""
+        state = super().get_state()
+        self.times.append((state, self.time))
+        return state
+
+    def set_state(self, state: object) -> None:
+        """See `Slave`."""
+        super().set_state(state)
+        self.time = next(time for kept, time in self.times if kept is state)
+
+
+@pytest.mark.parametrize("estimator", ["mod", "rich"])
+@pytest.mark.parametrize("sequence", ["jacobi", "gauss-seidel"])
+def test_every_do_step_begins_where_its_slave_stands(estimator: str, sequence: str) -> None:
+    """Law: after accepted, rejected and compared steps T is the time of the slave's state."""
+    slaves = {"chassis": OnTime(CHASSIS, np.zeros(2)), "wheel": OnTime(WHEEL, np.zeros(2))}
+    system = car(estimator=estimator, sequence=sequence, stop_time=0.1, initial_step_size=0.02)
+    found = run_slaves(system, slaves)
+    assert found.error is None, found.error
+    assert found.result.summary["rejected_double_steps"] > 0
+    assert {slave.time for slave in slaves.values()} == {0.1}
+
+
+@pytest.mark.parametrize("controller", ["elementary", "pi"])
+def test_a_fine_grid_makes_no_difference_to_the_control(controller: str) -> None:
+    """Law: where H is a multiple of a microsecond it follows the error as it does without a grid.
+
+    The nearest multiple is below what the control wants, which is no reason to keep to what was
+    wanted: as many double steps are rejected as without.
+    """
+    counts = []
+    for rules in ({}, {"step_multiple": 1e-6}):
+        system = car(controller=controller, order=0, stop_time=1.0, largest_step_size=0.1)
+        for name in system.slaves:
+            system = system.with_slave(name, **rules)
+        found = run_slaves(system, {"chassis": CHASSIS.slave(), "wheel": WHEEL.slave()})
+        assert found.error is None
+        accepted = found.result.steps["accepted"]
+        counts.append((int(accepted.sum()), int((~accepted).sum())))
+    (free, rejected), (on_grid, rejected_on_grid) = counts
+    assert on_grid == pytest.approx(free, rel=0.03)
+    assert abs(rejected_on_grid - rejected) <= 2
 
 
 def test_a_slave_of_one_step_size_among_others() -> None:

@@ -13,7 +13,8 @@ class DoubleStepTimes(NamedTuple):
 
     Attributes:
         begin, middle, end: communication points [s].
-        first, second: sizes of the small steps [s]; both are H but for rounding.
+        first, second: sizes of the small steps [s]; both are H but for the rounding of the times.
+            See `size_between`.
     """
 
     begin: float
@@ -28,6 +29,22 @@ class DoubleStepTimes(NamedTuple):
     ) -> DoubleStepTimes:
         """Two steps of H [s]; with ``stop_time`` the second ends exactly there."""
         middle = begin + step_size
+        first = size_between(begin, middle, step_size)
         if stop_time is None:
-            return DoubleStepTimes(begin, middle, middle + step_size, step_size, step_size)
-        return DoubleStepTimes(begin, middle, stop_time, step_size, stop_time - middle)
+            end = middle + step_size
+            return DoubleStepTimes(begin, middle, end, first, size_between(middle, end, step_size))
+        return DoubleStepTimes(begin, middle, stop_time, first, stop_time - middle)
+
+
+def size_between(begin: float, end: float, step_size: float) -> float:
+    """The size of a step of H between times [s] of which one is the other + H, but for rounding.
+
+    Far from t = 0 rounding moves T + H by up to a percent of H, the same way in step after step of
+    the same H. Slaves that took H would get ahead of the time or fall behind it, so there it is the
+    difference of the times. Where that is H to twelve digits it is H as it was given.
+    """
+    difference = end - begin
+    return step_size if abs(difference - step_size) <= _NEGLIGIBLE * step_size else difference
+
+
+_NEGLIGIBLE = 1e-12

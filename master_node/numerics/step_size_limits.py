@@ -8,7 +8,7 @@ from fractions import Fraction
 from math import ceil, lcm, ulp
 from typing import NamedTuple, TypeVar
 
-from master_node.numerics.double_step_times import DoubleStepTimes
+from master_node.numerics.double_step_times import DoubleStepTimes, size_between
 from master_node.numerics.step_size_controller import last_step_size
 
 _ROUNDING = 1e-10
@@ -191,6 +191,17 @@ class StepSizeLimits:
         end = float(zero + (done + 2 * units) * quantum)
         return DoubleStepTimes(begin, middle, end, size, size)
 
+    def is_cut_short(self, times: DoubleStepTimes, step_size: float) -> bool:
+        """Whether a double step has a smaller H than it would have with nothing to end on.
+
+        Args:
+            times: of the double step.
+            step_size: H that was wanted [s].
+        """
+        if self.quantum is None:
+            return times.first < DoubleStepTimes.from_step_size(times.begin, step_size).first
+        return _decimal(times.first) + self.quantum <= _decimal(step_size)
+
     def step(
         self, origin: float, begin: float, step_size: float, target: float
     ) -> tuple[float, float]:
@@ -203,7 +214,10 @@ class StepSizeLimits:
             size = left if step_size >= left else min(step_size, left / 2.0)
             rounding = self._rounding(begin, target)
             size = _planned(size, left, self.smallest, self.largest, rounding)
-            return (target, left) if size >= left else (begin + size, size)
+            if size >= left:
+                return target, left
+            end = begin + size
+            return end, size_between(begin, end, size)
         quantum, zero = self.quantum, _decimal(origin)
         done = self._units(origin, begin)
         units_left = self._units(origin, target) - done
@@ -250,12 +264,13 @@ class StepSizeLimits:
         """
         size = self.smallest
         if self.quantum is None:
-            return DoubleStepTimes(event - size, event, event + size, size, size)
+            begin, end = event - size, event + size
+            first, second = size_between(begin, event, size), size_between(event, end, size)
+            return DoubleStepTimes(begin, event, end, first, second)
         zero, step = _decimal(origin), _decimal(size)
         pair = 2 * step
-        end = zero + pair * ceil((_decimal(event) - zero) / pair)
-        begin, middle = float(end - pair), float(end - step)
-        return DoubleStepTimes(begin, middle, float(end), size, size)
+        last = zero + pair * ceil((_decimal(event) - zero) / pair)
+        return DoubleStepTimes(float(last - pair), float(last - step), float(last), size, size)
 
 
 _Size = TypeVar("_Size", int, float)
