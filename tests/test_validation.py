@@ -155,6 +155,7 @@ CAPABILITIES = {
     "loop_b": replace(LAG, states=(("native", AT_REST),)),
     "bouncing_ball_me2": replace(HELD, inputs="no continuous inputs"),
     "bouncing_ball_me3": replace(HELD, inputs="no continuous inputs"),
+    "relay_me2": replace(WHOLE, outputs="none", states=(("native", AT_REST),)),
     "all_types2": HELD,
     "all_types3": replace(HELD, zero=UNREACHED, remark="clock clock (triggered) is ignored"),
 }  # fmt: skip

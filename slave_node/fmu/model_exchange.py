@@ -19,6 +19,7 @@ from protocol.slave import Slave, StartValue, StepStatus
 from slave_node.fmu.continuous_model import ContinuousModel, Fmi2Model, Fmi3Model
 from slave_node.fmu.cvode import CVode, Outcome
 from slave_node.fmu.description import FmuModel
+from slave_node.fmu.event_indicators import make_event, root_values
 from slave_node.fmu.exchange import InputPolynomials
 from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.saved_state import SavedState, pack, unpack
@@ -137,6 +138,8 @@ class ModelExchangeSlave(FmuSlave):
     def _roots(self, time: float, states: Any, result: Any) -> None:
         self._set_point(time, states)
         self._model.transfer("indicators", result, self._indicator_count)
+        values = np.ctypeslib.as_array(result, (self._indicator_count,))
+        values[:] = root_values(values, self._indicators)
 
     # ---- Events -------------------------------------------------------------------------------
 
@@ -156,8 +159,9 @@ class ModelExchangeSlave(FmuSlave):
         """Whether the inputs that were set jumped over a zero of an event indicator."""
         if not self._indicator_count:
             return False
-        now = self._model.vector("indicators", self._indicator_count)
-        return bool(((now > 0.0) != (self._indicators > 0.0)).any())
+        return make_event(
+            self._model.vector("indicators", self._indicator_count), self._indicators
+        )
 
     def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
         """See `Slave`. A change is an event."""

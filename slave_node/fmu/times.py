@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
 
 _SLACK = 1e-4
+
+_LOCATED = 200.0 * sys.float_info.epsilon
+"""CVode locates a root to half of this part of the time and of its internal step."""
 
 
 def meet(one: float, other: float) -> bool:
@@ -33,6 +37,7 @@ class ReportedEvent:
         self.slack = _SLACK * (time - begin)
 
     def is_expected(self, time: float, begin: float, end: float) -> bool:
-        """Whether ``time`` is that event, in a step that ends or begins with it."""
+        """Whether ``time`` is that event, in a step that ends or begins with it, or is ``begin``."""
         borders = meet(end, self.time) or meet(begin, self.time)
-        return meet(time, begin) or (borders and abs(time - self.time) <= self.slack)
+        is_begin = time - begin <= _LOCATED * (abs(time) + end - begin)
+        return is_begin or (borders and abs(time - self.time) <= self.slack)
