@@ -412,6 +412,29 @@ def test_a_relay_whose_input_rests_at_the_limit(
         assert slave.get_discrete_outputs()[0] is (is_on if way != slope else not is_on)
 
 
+def test_what_a_slave_was_taken_back_from_leaves_no_trace(load: Load) -> None:
+    """Whether it has told of an event before or not: the same steps give the same, also where they
+    end a bit before or behind the event.
+    """
+    rows = np.array([[293.15], [2.0]])
+    for end in (0.625, 0.625 - 1e-8, 0.625 + 1e-8, 0.625 - 1e-5, 0.625 + 1e-5):
+        seen = []
+        for was_told in (False, True):
+            slave = relay(load, is_on=True, early_return=True)
+            state = slave.get_state()
+            if was_told:
+                slave.set_inputs(rows)
+                result = slave.do_step(0.125, 1.0, False)
+                assert result.status is StepStatus.EARLY_RETURN
+                assert result.time == pytest.approx(0.625, abs=1e-12)
+                slave.set_state(state)
+            slave.set_inputs(rows)
+            steps = [slave.do_step(0.125, 0.25, False), slave.do_step(0.375, end - 0.375, False)]
+            seen.append((steps, slave.get_discrete_outputs()))
+            slave.free_state(state)
+        assert seen[0] == seen[1]
+
+
 def test_a_second_life_is_as_good_as_the_first(load: Load) -> None:
     """Reset forgets solver, events and inputs."""
     slave = wheel(load, 3)
