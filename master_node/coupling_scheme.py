@@ -60,7 +60,7 @@ class CouplingScheme:
         return int(len(self.groups) > 1)
 
     def open_loop(self, coupled: CoupledSystem) -> tuple[str, ...]:
-        """An algebraic loop of which not all slaves are evaluated: inputs are extrapolated round it.
+        """An algebraic loop of which not all slaves are evaluated: its inputs are extrapolated.
 
         Returns:
             ``slave.variable`` along it; empty if there is none.

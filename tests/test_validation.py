@@ -210,8 +210,12 @@ def test_every_report_is_true(request: pytest.FixtureRequest, folder: str, fmu: 
         request.getfixturevalue(folder) / f"{fmu}.fmu", validate=False
     ).modelVariables
     counts = [
-        sum(int(np.prod([d.start or 1 for d in v.dimensions])) for v in variables if v.causality == c)
-        for c in ("input", "output")
+        sum(
+            int(np.prod([size.start or 1 for size in v.dimensions]))
+            for v in variables
+            if v.causality == kind
+        )
+        for kind in ("input", "output")
     ]
     check("initialize", "inputs: {}, outputs: {}".format(*counts))
     check(steps, truth.steps)

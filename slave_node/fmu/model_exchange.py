@@ -161,9 +161,7 @@ class ModelExchangeSlave(FmuSlave):
         """Whether an event indicator has changed its domain since the last event or point."""
         if not self._indicator_count:
             return False
-        return make_event(
-            self._model.vector("indicators", self._indicator_count), self._indicators
-        )
+        return make_event(self._model.vector("indicators", self._indicator_count), self._indicators)
 
     def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
         """See `Slave`. A change is an event."""
