@@ -182,8 +182,8 @@ class CheckpointStore:
         except FileNotFoundError as error:
             raise ResultsError(
                 f"{self.directory} holds no checkpoint",
-                remedy="a run can be resumed when it did not get to its end and its "
-                "checkpoint_interval was not 0; run the system again",
+                remedy="a run can be resumed when it began to step, did not get to its end, and "
+                "its checkpoint_interval was not 0; run the system again",
             ) from error
         except OSError as error:
             raise cannot_read(path, error) from error

@@ -60,6 +60,10 @@ MetricsPort = Annotated[
 MetricsHost = Annotated[str, typer.Option(help="Address for that; nobody is asked who he is.")]
 LogStyle = Annotated[LogFormat, typer.Option(help="Of messages on standard error.")]
 ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
+Results = Annotated[
+    Path,
+    typer.Argument(help="A result directory, or a single file .csv, .arrow, .parquet or .mat."),
+]
 
 
 @app.command()
@@ -331,12 +335,12 @@ def plot(
 
 @app.command()
 def compare(
-    a: ResultDirectory,
-    b: ResultDirectory,
+    a: Results,
+    b: Results,
     rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = 1e-3,
     atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = 1e-6,
 ) -> None:
-    """Compare two result directories, |A - B| <= atol + rtol |B|; exit code 1 when they differ."""
+    """Compare two results, |A - B| <= atol + rtol |B|; exit code 1 when they differ."""
     from rich.console import Console  # noqa: PLC0415
 
     from master_node.compare import compare as compare_results  # noqa: PLC0415

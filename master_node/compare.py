@@ -134,7 +134,10 @@ def compare(a: Path, b: Path, rtol: float, atol: float) -> Comparison:
     first, second = Result.load(a), Result.load(b)
     names = [name for name in first if name in second]
     if not names:
-        raise ResultsError(f"{a} and {b} have no variable in common")
+        raise ResultsError(
+            f"{a} and {b} have no variable in common: {_some(first)}, and {_some(second)}",
+            remedy="in a file of another program, call the columns slave.variable",
+        )
     start, stop = _common_range(a, first.time, b, second.time)
     inside = (first.time >= start) & (first.time <= stop)
     time = first.time[inside]
@@ -171,6 +174,12 @@ def compare(a: Path, b: Path, rtol: float, atol: float) -> Comparison:
         and list(first.discrete) == list(second.discrete)
         and all(_same(first[name], second[name]) for name in first.discrete),
     )
+
+
+def _some(result: Result) -> str:
+    """The first of its variables, for a message."""
+    names = list(result)
+    return ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
 
 
 class _Onto:

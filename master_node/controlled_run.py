@@ -437,6 +437,12 @@ class ControlledRun:
             remedy = "raise the tolerances: a slave takes no other step size"
         elif self._limits.quantum is not None and times.first == float(self._limits.quantum):
             remedy = f"raise the tolerances: step sizes are multiples of {times.first!r} s"
+        loop = self._scheme.open_loop(self._coupled)
+        if loop:
+            remedy = (
+                f"solve the algebraic loop {' -> '.join(loop)} at each communication point by "
+                f"evaluate_outputs and outputs_follow_inputs; or {remedy}"
+            )
         return StepSizeError(
             f"rejected at the smallest communication step size: {reason}",
             phase="double step",

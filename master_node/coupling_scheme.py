@@ -59,6 +59,17 @@ class CouplingScheme:
         """How many points at the end of a step are known for some inputs before it: 0 or 1."""
         return int(len(self.groups) > 1)
 
+    def open_loop(self, coupled: CoupledSystem) -> tuple[str, ...]:
+        """An algebraic loop of which not all slaves are evaluated: its inputs are extrapolated.
+
+        Returns:
+            ``slave.variable`` along it; empty if there is none.
+        """
+        slaves = dict(zip(coupled.output_names, coupled.output_slave.tolist(), strict=True))
+        loop = coupled.at_point.loop
+        is_solved = all(slaves.get(name) in self.evaluated for name in loop)
+        return () if is_solved else loop
+
     @staticmethod
     def of(coupled: CoupledSystem, system: System) -> CouplingScheme:
         """The scheme that ``system`` asks for, as far as the slaves can follow."""

@@ -125,7 +125,8 @@ class ModelSlave(Slave):
         discrete_outputs: Sequence[str] = (),
         early_return: bool = False,  # noqa: ARG002  it never does
     ) -> None:
-        """See `Slave`. Inputs that are not among ``inputs`` keep their start values.
+        """See `Slave`. Inputs that are not among ``inputs`` keep their start values, those among
+        ``discrete_inputs`` what they are set to: something that is not continuous drives them.
 
         ``relative_tolerance`` is that of the inner solver; times the nominal value of a state
         it is the absolute one. ``stop_time`` does not matter: a model goes on as long as asked.
@@ -134,7 +135,7 @@ class ModelSlave(Slave):
             ConfigurationError: a name that the model does not have, or a value of the wrong type.
             SlaveError: the model's ``prepare`` failed.
         """
-        refuse_discrete(self.description, discrete_inputs, discrete_outputs)
+        refuse_discrete(self.description, (), discrete_outputs)
         del stop_time
         for name, value in start_values.items():
             self._start[name] = self._start_value(name, value)
@@ -142,6 +143,8 @@ class ModelSlave(Slave):
         if not 0.0 < tolerance < 1.0:
             raise ConfigurationError(f"relative tolerance {tolerance!r} is not between 0 and 1")
         self._set_up(start_time, max(float(tolerance), MIN_TOLERANCE), inputs, outputs)
+        self._columns("input", [*inputs, *discrete_inputs], self._input_names)  # each but once
+        self._held_columns = self._columns("input", discrete_inputs, self._input_names)
         try:
             self._model.prepare()
         except DoublestepError:
@@ -167,6 +170,7 @@ class ModelSlave(Slave):
         """Make the model and its first state from the start values."""
         self._tolerance = tolerance
         self._input_columns = self._columns("input", inputs, self._input_names)
+        self._held_columns = list[int]()
         self._output_columns = self._columns("output", outputs, self._output_names)
         try:
             self._model = self._model_class()
@@ -254,7 +258,21 @@ class ModelSlave(Slave):
             )
         u = np.zeros((rows, len(self._input_names)))
         u[0] = self._start_inputs
+        u[0, self._held_columns] = self._state.inputs.derivatives[0, self._held_columns]
         u[:, self._input_columns] = derivatives
+        self._state = replace(self._state, inputs=InputSignal(_read_only(u)))
+
+    def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
+        """See `Slave`. They are held until they are set again.
+
+        Raises:
+            SlaveError: another number of values, or one that is no number.
+        """
+        names = [self._input_names[column] for column in self._held_columns]
+        if len(values) != len(names) or not all(type(value) in (float, int) for value in values):
+            raise SlaveError(f"{list(values)!r} are no numbers for {names}")
+        u = self._state.inputs.derivatives.copy()
+        u[0, self._held_columns] = values
         self._state = replace(self._state, inputs=InputSignal(_read_only(u)))
 
     def do_step(

@@ -243,9 +243,8 @@ class _Validation:
             return Finding(
                 "initialize", Grade.PROBLEM, f"{bad[0]} is not finite", "a run would not start"
             )
-        return Finding(
-            "initialize", Grade.OK, f"inputs: {len(self._inputs)}, outputs: {len(self._outputs)}"
-        )
+        inputs, outputs = map(self._description.of, (Causality.INPUT, Causality.OUTPUT))
+        return Finding("initialize", Grade.OK, f"inputs: {len(inputs)}, outputs: {len(outputs)}")
 
     def _steps(self) -> Finding:
         """Also finds a size of steps that the model takes, for what is tried after this."""

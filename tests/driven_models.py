@@ -31,3 +31,16 @@ class Sum(Model):
     def output_values(self, t: float, x: Any, u: Any) -> list[float]:
         """The output."""
         return [u[0] + u[1]]
+
+
+class Room(Model):
+    """2 T' = 30 on - (T - 283.15), in K and s: a heater that something else switches."""
+
+    inputs = (real("on"),)
+    states = (real("T", "K", start=293.15),)
+    outputs = states
+    solver = "DOP853"
+
+    def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
+        """The temperature."""
+        return [(30.0 * u[0] - (x[0] - 283.15)) / 2.0]

@@ -52,6 +52,46 @@ def test_discrete_outputs_switch_other_slaves(capability_dir: Path, estimator: s
     assert result["clock.toggle_out"].dtype == np.bool_
 
 
+def thermostat(folder: Path, state: str | None = None, stop_time: float = 2.0) -> System:
+    """A room that a relay FMU for model exchange keeps between 292.15 and 294.15 K."""
+    return System(
+        simulation={
+            "stop_time": stop_time,
+            "relative_tolerance": 1e-6,
+            "absolute_tolerance": 1e-6,
+        },
+        slaves={
+            "room": {"model": "driven_models.py:Room"},
+            "relay": {"model": str(folder / "relay_me2.fmu"), "state": state},
+        },
+        connections=[("room.T", "relay.u"), ("relay.is_on", "room.on")],
+        base=Path(__file__).parent,
+    )
+
+
+def test_a_thermostat_switches_when_theory_says_so(capability_dir: Path) -> None:
+    """The temperature is c + d exp(-t/2) between the limits; each switch is an event."""
+    result = simulate(thermostat(capability_dir), in_process=True)
+    warming, cooling = 2.0 * np.log(21.0 / 19.0), 2.0 * np.log(11.0 / 9.0)
+    cycle = [warming, cooling, warming, cooling, warming]
+    expected = 2.0 * np.log(10.0 / 9.0) + np.cumsum([0.0, *cycle])
+    changes = np.flatnonzero(np.diff(result["relay.is_on"].astype(int)))
+    np.testing.assert_allclose(result.time[changes + 1], expected, rtol=0.0, atol=1e-6)
+    assert (np.diff(result.time) > 0.0).all()
+    assert result["relay.changes"][-1] == len(expected)
+
+
+@pytest.mark.parametrize("state", ["fork", "replay"])
+def test_events_are_the_same_however_states_are_saved(capability_dir: Path, state: str) -> None:
+    """A slave that was taken back from an event forgets that it told of it: bit for bit."""
+    native = simulate(thermostat(capability_dir, stop_time=0.22), in_process=True)
+    other = simulate(thermostat(capability_dir, state, stop_time=0.22), in_process=True)
+    assert native["relay.changes"][-1] == 1
+    assert other.time.tobytes() == native.time.tobytes()
+    assert other.outputs.tobytes() == native.outputs.tobytes()
+    np.testing.assert_array_equal(other["relay.changes"], native["relay.changes"])
+
+
 @pytest.mark.parametrize("estimator", ["mod", "rich"])
 @pytest.mark.parametrize(
     ("rules", "smallest", "delay"),

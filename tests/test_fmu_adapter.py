@@ -497,6 +497,19 @@ def test_an_fmu_for_one_instance_per_process_has_one(
     start(load(fmu))
 
 
+def test_output_derivatives_that_are_refused_come_with_a_remedy(
+    fmu_dir: Path, tmp_path: Path, load: Load
+) -> None:
+    """An FMU that declares more of them than it gives would end every run at its start."""
+    order = "maxOutputDerivativeOrder"
+    fmu = changed(fmu_dir, tmp_path / "wheel.fmu", (f'{order}="1"', f'{order}="2"'))
+    slave = start(load(fmu))
+    slave.get_outputs(1)
+    with pytest.raises(SlaveError, match="fmi2GetRealOutputDerivatives returned fmi2Error") as info:
+        slave.get_outputs(2)
+    assert "derivative_points = 0" in info.value.remedy
+
+
 FMI_4 = """<?xml version="1.0"?>
 <fmiModelDescription fmiVersion="4.0" modelName="m" instantiationToken="{0}">
 <CoSimulation modelIdentifier="m"/><ModelVariables/><ModelStructure/>

@@ -362,6 +362,79 @@ def test_a_ball_at_rest_stays_there(load: Load) -> None:
     np.testing.assert_array_equal(slave.get_outputs(0), [[0.0, 0.0]])
 
 
+SLOPES = [0.3, -0.3, 1.7, -1.7, 12.5, -12.5]
+
+
+def relay(load: Load, *, is_on: bool, early_return: bool = False) -> Slave:
+    """The relay, held between its limits 292.15 and 294.15."""
+    slave = started(
+        load("relay_me2"),
+        inputs=("u",),
+        discrete_outputs=("is_on", "changes"),
+        early_return=early_return,
+        start_values={"u": 290.0 if is_on else 293.15},
+    )
+    assert slave.get_discrete_outputs() == (is_on, int(is_on))
+    slave.set_inputs(np.array([[293.15]]))
+    slave.do_step(0.0, 0.125, False)
+    return slave
+
+
+@pytest.mark.parametrize("slope", SLOPES)
+def test_a_relay_switches_whatever_the_rounding_is(load: Load, slope: float) -> None:
+    """It compares strictly. An event that is located where the input *is* the limit would change
+    nothing, and never come again.
+    """
+    slave = relay(load, is_on=slope > 0)
+    slave.set_inputs(np.array([[293.15], [slope]]))
+    assert slave.do_step(0.125, 4.0 / abs(slope), False).status is StepStatus.OK
+    assert slave.get_discrete_outputs() == (slope < 0, 1 + (slope > 0))
+
+
+@pytest.mark.parametrize("slope", [1.0, -1.0])
+@pytest.mark.parametrize("early_return", [False, True])
+def test_a_relay_whose_input_rests_at_the_limit(
+    load: Load, slope: float, *, early_return: bool
+) -> None:
+    """At the limit, for whole steps, it does not switch; beyond it does, and back it does not. The
+    master is not told of an event where its step begins.
+    """
+    limit = 294.15 if slope > 0 else 292.15
+    is_on = slope > 0
+    for way in (slope, -slope):
+        slave = relay(load, is_on=is_on, early_return=early_return)
+        slave.set_inputs(np.array([[limit]]))
+        for begin in (0.125, 0.25):
+            assert slave.do_step(begin, 0.125, False) == (StepStatus.OK, begin + 0.125)
+            assert slave.get_discrete_outputs()[0] is is_on
+        slave.set_inputs(np.array([[limit], [way]]))
+        assert slave.do_step(0.375, 0.5, False) == (StepStatus.OK, 0.875)
+        assert slave.get_discrete_outputs()[0] is (is_on if way != slope else not is_on)
+
+
+def test_what_a_slave_was_taken_back_from_leaves_no_trace(load: Load) -> None:
+    """Whether it has told of an event before or not: the same steps give the same, also where they
+    end a bit before or behind the event.
+    """
+    rows = np.array([[293.15], [2.0]])
+    for end in (0.625, 0.625 - 1e-8, 0.625 + 1e-8, 0.625 - 1e-5, 0.625 + 1e-5):
+        seen = []
+        for was_told in (False, True):
+            slave = relay(load, is_on=True, early_return=True)
+            state = slave.get_state()
+            if was_told:
+                slave.set_inputs(rows)
+                result = slave.do_step(0.125, 1.0, False)
+                assert result.status is StepStatus.EARLY_RETURN
+                assert result.time == pytest.approx(0.625, abs=1e-12)
+                slave.set_state(state)
+            slave.set_inputs(rows)
+            steps = [slave.do_step(0.125, 0.25, False), slave.do_step(0.375, end - 0.375, False)]
+            seen.append((steps, slave.get_discrete_outputs()))
+            slave.free_state(state)
+        assert seen[0] == seen[1]
+
+
 def test_a_second_life_is_as_good_as_the_first(load: Load) -> None:
     """Reset forgets solver, events and inputs."""
     slave = wheel(load, 3)

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from master_node import Result, System
 from master_node.numerics.extrapolation import POLYNOMIALS, InputPolynomial
 from protocol.calls import StepResult
-from protocol.errors import StepRejectedError
+from protocol.errors import StepRejectedError, StepSizeError
 from protocol.slave import Slave
 from tests.quarter_car_case import (
     ALL,
@@ -187,6 +187,19 @@ def test_a_loop_that_has_no_solution_any_more_is_named(estimator: str) -> None:
     assert "a.y -> b.y" in text
     assert "residual" in text
     assert 0.4 < run.result.time[-1] <= 0.5
+
+
+def test_a_loop_that_is_not_evaluated_is_named_where_no_step_is_small_enough() -> None:
+    """Errors grow round it whatever H is, so the tolerances alone are no remedy. Where the loop is
+    evaluated it is not named.
+    """
+    run = run_slaves(loop(2.0, -3.0, evaluate_outputs=False))
+    assert isinstance(run.error, StepSizeError)
+    assert "a.y -> b.y" in run.error.remedy
+    assert "evaluate_outputs" in run.error.remedy
+    hopeless = run_slaves(loop(0.5, 0.6, smallest_step_size=0.5, relative_tolerance=1e-9))
+    assert isinstance(hopeless.error, StepSizeError)
+    assert "loop" not in hopeless.error.remedy
 
 
 # ---- Who takes part -----------------------------------------------------------------------------

@@ -516,6 +516,28 @@ def bouncing_ball() -> Iterator[Fmu]:
         )
 
 
+def relay() -> Fmu:
+    """Model exchange with state events from an input, and without states."""
+    return make_fmu(
+        Description(
+            name="relay_me2",
+            description="A relay with hysteresis that switches strictly beyond its limits",
+            variables=(
+                Variable("u", 0, "input", start="293.15"),
+                Variable("low", 1, "parameter", start="292.15"),
+                Variable("high", 2, "parameter", start="294.15"),
+                Variable("is_on", 5, "output", "Boolean", depends=()),
+                Variable("changes", 6, "output", "Int32", depends=()),
+            ),
+            experiment=EXPERIMENT,
+            event_indicators=("u - low", "u - high"),
+        ),
+        (SOURCES / "relay.c",),
+        version=2,
+        kind="ModelExchange",
+    )
+
+
 # ---- All types ----------------------------------------------------------------------------------
 
 COLOURS = ("Colour", ("red", "green", "blue"))
@@ -607,6 +629,7 @@ FMUS = (
     *units(),
     *loops(),
     *bouncing_ball(),
+    relay(),
     all_types2(),
     all_types3(),
 )

@@ -21,7 +21,7 @@ from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import ADDRESS, DISCARD, ERROR, WARNING, FmuInstance
 from slave_node.fmu.log import FmuLog, wanted_categories
 from slave_node.fmu.saved_state import SavedState, pack, unpack
-from slave_node.fmu.times import ReportedEvent, meet
+from slave_node.fmu.times import is_at_border, meet
 from slave_node.fmu.values import ValueType
 
 MAX_EVENTS = 10_000
@@ -223,7 +223,6 @@ class Fmi3Slave(FmuSlave):
     def _start(self, time: float, *, early_return: bool) -> None:
         self._time = self._inputs_time = time
         self._returns_early = early_return
-        self._reported = ReportedEvent()
         self._is_initializing = True
 
     # ---- Initialization -----------------------------------------------------------------------
@@ -333,10 +332,7 @@ class Fmi3Slave(FmuSlave):
                 ends = has_event and self._has_event_mode and self._handle_event()
                 return StepResult(StepStatus.TERMINATED if ends else _STEP_OK, end)
             self._time = reached
-            if self._returns_early and not self._reported.is_expected(
-                reached, communication_point, end
-            ):
-                self._reported.report(reached, communication_point)
+            if self._returns_early and not is_at_border(reached, communication_point, end):
                 return StepResult(StepStatus.EARLY_RETURN, reached)
             if has_event and self._has_event_mode and self._handle_event():
                 return StepResult(StepStatus.TERMINATED, reached)

@@ -194,7 +194,7 @@ class FmuInstance(ABC):
 
     # ---- Calls --------------------------------------------------------------------------------
 
-    def check(self, function: str, status: int) -> None:
+    def check(self, function: str, status: int, *, remedy: str = "") -> None:
         """Turn any status that is not OK or a warning into an error with the FMU's own words."""
         if status in (OK, WARNING):
             return
@@ -202,7 +202,7 @@ class FmuInstance(ABC):
         name = f"{self.prefix}{_STATUS[status]}" if known else f"status {status}"
         text = self.log.explain(f"{function} returned {name}")
         self._is_fatal = self._is_fatal or status == FATAL
-        raise FatalSlaveError(text) if status == FATAL else SlaveError(text)
+        raise FatalSlaveError(text) if status == FATAL else SlaveError(text, remedy=remedy)
 
     def call(self, method: Callable[..., T], *arguments: Any, **named: Any) -> T:
         """Call a method of fmpy; its exception for a status as ours."""

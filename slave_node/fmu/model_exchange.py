@@ -19,10 +19,11 @@ from protocol.slave import Slave, StartValue, StepStatus
 from slave_node.fmu.continuous_model import ContinuousModel, Fmi2Model, Fmi3Model
 from slave_node.fmu.cvode import CVode, Outcome
 from slave_node.fmu.description import FmuModel
+from slave_node.fmu.event_indicators import make_event, root_values
 from slave_node.fmu.exchange import InputPolynomials
 from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.saved_state import SavedState, pack, unpack
-from slave_node.fmu.times import ReportedEvent, meet
+from slave_node.fmu.times import SLACK, is_at_border, meet
 
 DEFAULT_TOLERANCE = 1e-6
 MIN_TOLERANCE = 1e-13
@@ -33,6 +34,9 @@ MAX_INNER_STEPS = 100_000
 
 MAX_EVENTS = 10_000
 """In one communication step: more are a model that stands still at events without end."""
+
+_HALVINGS = 30
+"""Of the slack behind a step, to locate an event in it."""
 
 _STEPS_WITHOUT_STATES = 20
 """Internal steps in a communication step of a model that has indicators and no states."""
@@ -67,7 +71,6 @@ class ModelExchangeSlave(FmuSlave):
         self._time = self._inputs_time = self._model_time = time
         self._tolerance = max(tolerance or DEFAULT_TOLERANCE, MIN_TOLERANCE)
         self._returns_early = early_return
-        self._reported = ReportedEvent()
         self._is_initializing = True
         self._rows_set = 1
         self._first_step = 0.0
@@ -137,6 +140,8 @@ class ModelExchangeSlave(FmuSlave):
     def _roots(self, time: float, states: Any, result: Any) -> None:
         self._set_point(time, states)
         self._model.transfer("indicators", result, self._indicator_count)
+        values = np.ctypeslib.as_array(result, (self._indicator_count,))
+        values[:] = root_values(values, self._indicators)
 
     # ---- Events -------------------------------------------------------------------------------
 
@@ -152,12 +157,11 @@ class ModelExchangeSlave(FmuSlave):
             self._indicators = self._model.vector("indicators", self._indicator_count)
         return terminate
 
-    def _inputs_made_event(self) -> bool:
-        """Whether the inputs that were set jumped over a zero of an event indicator."""
+    def _changed_domains(self) -> bool:
+        """Whether an event indicator has changed its domain since the last event or point."""
         if not self._indicator_count:
             return False
-        now = self._model.vector("indicators", self._indicator_count)
-        return bool(((now > 0.0) != (self._indicators > 0.0)).any())
+        return make_event(self._model.vector("indicators", self._indicator_count), self._indicators)
 
     def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
         """See `Slave`. A change is an event."""
@@ -190,9 +194,8 @@ class ModelExchangeSlave(FmuSlave):
         if not meet(begin, self._time):
             raise SlaveError(f"a step from {begin!r} s, but the slave stands at {self._time!r} s")
         time = max(begin, self._model_time)
-        if self._inputs_made_event() and self._handle_event():
+        if self._changed_domains() and self._handle_event():
             return StepResult(StepStatus.TERMINATED, time)
-        is_expected = self._returns_early and meet(end, self._reported.time)
         for _ in range(MAX_EVENTS):
             stop = max(min(end, self._model.next_event_time), time)
             time, has_event, ends = self._integrate(time, stop, step_size, no_set_state_prior)
@@ -200,13 +203,10 @@ class ModelExchangeSlave(FmuSlave):
             self._model_time, self._time = time, end if is_last else time
             if ends:
                 return StepResult(StepStatus.TERMINATED, self._time)
-            if has_event and self._returns_early and not is_last:
-                if not self._reported.is_expected(time, begin, end):
-                    self._reported.report(time, begin)
-                    return StepResult(StepStatus.EARLY_RETURN, time)
-                is_expected = False
-            if is_last and is_expected and not has_event:
-                has_event = self._reach_expected_event(time, step_size)
+            if has_event and self._returns_early and not is_at_border(time, begin, end):
+                return StepResult(StepStatus.EARLY_RETURN, time)
+            if is_last and not has_event and self._returns_early:
+                has_event = self._reach_event_ahead(time, SLACK * step_size)
             if has_event and self._handle_event():
                 return StepResult(StepStatus.TERMINATED, self._time)
             if is_last:
@@ -214,24 +214,32 @@ class ModelExchangeSlave(FmuSlave):
                 return StepResult(StepStatus.OK, end)
         raise StepRejectedError(f"more than {MAX_EVENTS} events in one step")
 
-    def _reach_expected_event(self, time: float, step_size: float) -> bool:
-        """Whether the event that was reported for ``time`` comes just behind it.
+    def _reach_event_ahead(self, time: float, slack: float) -> bool:
+        """Whether an event comes within ``slack`` [s] behind the end of a step, at ``time``.
 
-        The FMU then stands at the event, a bit ahead of the communication point.
+        The FMU then stands at the event, a bit ahead of the communication point. On so short a
+        way the states move along their derivatives.
         """
-        state = self.get_state()
-        ahead, has_event, _ = self._integrate(
-            time,
-            time + self._reported.slack,
-            step_size,
-            no_set_state_prior=False,
-        )
-        if has_event:
-            self._model_time = ahead
-        else:
-            self.set_state(state)
-        self.free_state(state)
-        return has_event
+        if not self._indicator_count:
+            return False
+        states, slopes = self._model.vector("states", self._size), np.zeros(self._size)
+        self._model.transfer("derivatives", slopes.ctypes.data, self._size)
+
+        def is_behind(ahead: float) -> bool:
+            moved = states + ahead * slopes
+            self._set_point(time + ahead, moved.ctypes.data)
+            return self._changed_domains()
+
+        if not is_behind(slack):
+            self._set_point(time, states.ctypes.data)
+            return False
+        before, behind = 0.0, slack
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (before + behind)
+            before, behind = (before, middle) if is_behind(middle) else (middle, behind)
+        is_behind(behind)
+        self._model_time = time + behind
+        return True
 
     def _integrate(
         self, time: float, stop: float, step_size: float, no_set_state_prior: bool

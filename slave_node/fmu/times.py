@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 
-_SLACK = 1e-4
+SLACK = 1e-6
+"""The part of a step by which an event moves that is located again in a step that ends there."""
+
+_LOCATED = 200.0 * sys.float_info.epsilon
+"""CVode locates a root to half of this part of the time and of its internal step."""
 
 
 def meet(one: float, other: float) -> bool:
@@ -12,27 +17,13 @@ def meet(one: float, other: float) -> bool:
     return abs(one - other) <= 4.0 * math.ulp(max(abs(one), abs(other)))
 
 
-class ReportedEvent:
-    """The event within a step that the master was told of last.
+def is_at_border(time: float, begin: float, end: float) -> bool:
+    """Whether an event at ``time`` is one at the begin or the end of a step [s].
 
-    The master goes back and comes again with a step that ends there. Then the event can lie a bit
-    earlier or later, as the solver takes other steps: it is not to be told of once more.
-
-    Attributes:
-        time: of the event [s], NaN if there was none.
-        slack: how far it can have moved [s].
+    The master is not told of it: it stands there, or will. A master that was told of an event goes
+    back and comes again with a step that ends there; then it lies a bit earlier or later. All this
+    depends on the step alone, as a slave has no memory of what it was taken back from.
     """
-
-    def __init__(self) -> None:
-        self.time = math.nan
-        self.slack = 0.0
-
-    def report(self, time: float, begin: float) -> None:
-        """The master is told of an event at ``time`` in a step from ``begin`` [s]."""
-        self.time = time
-        self.slack = _SLACK * (time - begin)
-
-    def is_expected(self, time: float, begin: float, end: float) -> bool:
-        """Whether ``time`` is that event, in a step that ends or begins with it."""
-        borders = meet(end, self.time) or meet(begin, self.time)
-        return meet(time, begin) or (borders and abs(time - self.time) <= self.slack)
+    h = end - begin
+    located = _LOCATED * (max(abs(begin), abs(end)) + h)
+    return time - begin <= located or end - time <= max(located, SLACK * h)
