@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -155,6 +155,19 @@ def run(  # noqa: PLR0917  options of the command line
     with _interruptible(), ExitStack() as stack:
         if stay_with_parent:
             _end_with_parent()
+        if in_process:
+            _refuse_beside_in_process(
+                {
+                    "--no-launch": no_launch,
+                    "--connect": connect,
+                    "--listen": listen,
+                    "--insecure": insecure,
+                    "--tls": tls,
+                    "--mode": mode,
+                    "--timeout": timeout is not None,
+                    "--pin": pin,
+                }
+            )
         from master_node.progress import (  # noqa: PLC0415  each command imports what it needs
             ProgressBar,
             UploadBar,
@@ -213,6 +226,15 @@ def run(  # noqa: PLR0917  options of the command line
         except KeyboardInterrupt:
             raise InterruptedRunError("interrupted before the first step") from None
         _show(output, quiet=quiet, no_plot=no_plot)
+
+
+def _refuse_beside_in_process(options: Mapping[str, object]) -> None:
+    given = [name for name, value in options.items() if value]
+    if given:
+        raise ConfigurationError(
+            f"{given[0]} is for slaves on the bus, and with --in-process there is none",
+            remedy=f"leave out {given[0]} or --in-process",
+        )
 
 
 def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:

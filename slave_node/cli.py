@@ -11,7 +11,6 @@ import socket
 import sys
 import tempfile
 import threading
-import tomllib
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -29,6 +28,7 @@ from protocol.errors import ConfigurationError, DoublestepError
 from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
 from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.slave import StartValue
+from protocol.toml_text import toml_value
 
 if TYPE_CHECKING:
     from slave_node.worker import Worker
@@ -452,10 +452,7 @@ def _parameters(assignments: list[str]) -> dict[str, StartValue]:
         name, equals, text = assignment.partition("=")
         if not equals or not name:
             raise ConfigurationError(f"--parameter {assignment}: write name=value")
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            value = text
+        value = toml_value(text)
         if not isinstance(value, float | int | bool | str):
             raise ConfigurationError(f"--parameter {assignment}: not a number, boolean or string")
         values[name.strip()] = value
