@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import tomli_w
 
 from master_node import Result, load_system, simulate
 from master_node.cli import main
@@ -749,6 +751,32 @@ def test_an_fmu_that_cannot_be_used(
     assert "Traceback" not in master.text
 
 
+@pytest.mark.parametrize(
+    ("model", "timeout", "code", "words"),
+    [
+        ("--help", "30", 2, "chassis: '--help' is not a model"),
+        ("aborts.py:Model", "30", 4, "chassis: load: the process that held the model died by"),
+        ("sleeps.py:Model", "3", 3, "its process was started and still loads the model"),
+    ],
+)
+def test_a_model_that_does_not_get_loaded(  # noqa: PLR0917
+    model: str, timeout: str, code: int, words: str, start: Start, tmp_path: Path
+) -> None:
+    """A name is never an option of the slave's command; who crashes while it is loaded is told
+    from who is lost, and who takes too long from who was not started.
+    """
+    (tmp_path / "aborts.py").write_text("import os\nos.abort()\n")
+    (tmp_path / "sleeps.py").write_text("import time\ntime.sleep(60)\n")
+    file = system_file(tmp_path)
+    tables = tomllib.loads(file.read_text())
+    tables["slaves"]["chassis"] = {"model": model}
+    file.write_text(tomli_w.dumps(tables))
+    options = ("--timeout", timeout, "--output", tmp_path / "out")
+    master = start("master_node", "run", file, *options)
+    assert master.wait() == code, master.text
+    assert words in master.text.splitlines()[-1]
+
+
 def test_a_misspelt_variable(start: Start, tmp_path: Path) -> None:
     """Exit code 2 with the file, the connection and the nearest name; no step is taken."""
     file = system_file(tmp_path, connections=[*DISPLACEMENT[:3], ("wheel.v", "chassis.vw")])
@@ -783,6 +811,9 @@ def test_an_output_directory_that_cannot_be_written(start: Start, tmp_path: Path
         (["--estimator", "richardson"], "'rich', 'mod' or 'none'"),
         (["--listen", "7447"], "'7447' is not an endpoint"),
         (["--listen", "tcp/0.0.0.0:7447"], "--insecure"),
+        (["--timeout", "0"], "discovery_timeout = 0.0"),
+        (["--in-process", "--no-launch"], "leave out --no-launch or --in-process"),
+        (["--in-process", "--timeout", "0"], "--timeout is for slaves on the bus"),
     ],
 )
 def test_a_wrong_command_line(
