@@ -21,6 +21,7 @@ from protocol.credentials import Credentials, Role
 from protocol.endpoints import LOOPBACK
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
 from protocol.logs import LogFormat, about, configure_logs, logs_json
+from protocol.standard_output import guard_standard_output
 
 if TYPE_CHECKING:  # each command imports what it needs
     from master_node.observers import Observer
@@ -543,6 +544,7 @@ def _end_with_parent() -> None:
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
     configure_logs(LogFormat.TEXT, _TEXT_FORMAT)
+    guard_standard_output()
     try:
         app()
     except DoublestepError as error:

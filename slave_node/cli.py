@@ -28,6 +28,7 @@ from protocol.errors import ConfigurationError, DoublestepError
 from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
 from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.slave import StartValue
+from protocol.standard_output import guard_standard_output
 from protocol.toml_text import toml_value
 
 if TYPE_CHECKING:
@@ -494,6 +495,7 @@ def _end_with_parent(end: Callable[[str], None]) -> None:
 
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
+    guard_standard_output()
     try:
         app()
     except DoublestepError as error:

@@ -824,3 +824,39 @@ def test_a_wrong_command_line(
     assert code == 2
     assert message in text
     assert not (tmp_path / "out" / "results.csv").exists()
+
+
+# ---- Who reads what a command says --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("module", ["master_node", "slave_node"])
+def test_a_reader_that_has_left_changes_nothing(module: str) -> None:
+    """As with ``| head``: no message and the same exit code, as 1 has a meaning."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as closed:
+        done = subprocess.run(
+            [sys.executable, "-m", module, "--help"],
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            timeout=BOUND,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
+@pytest.mark.parametrize("module", ["master_node", "slave_node"])
+def test_an_output_that_cannot_be_written(module: str) -> None:
+    """Exit code 7 and one line."""
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", module, "--help"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            timeout=BOUND,
+            check=False,
+        )
+    assert done.returncode == 7
+    assert b"cannot write to the standard output: No space left" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
