@@ -21,6 +21,7 @@ from protocol.credentials import Credentials, Role
 from protocol.endpoints import LOOPBACK
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
 from protocol.logs import LogFormat, about, configure_logs, logs_json
+from protocol.processes import ending_signals
 from protocol.standard_output import guard_standard_output
 
 if TYPE_CHECKING:  # each command imports what it needs
@@ -41,7 +42,6 @@ log = logging.getLogger("master_node")
 
 _END_TIME = 5.0
 _TEXT_FORMAT = "%(levelname)s: %(message)s"
-_ENDING = (signal.SIGINT, signal.SIGTERM)
 
 Tls = Annotated[
     Path | None,
@@ -510,17 +510,19 @@ def _order(text: str | None) -> int | str | None:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the command with exit code 130, also where a shell ignores them.
+    """Ctrl-C, SIGTERM and SIGHUP end the command with exit code 130; the first two also where a
+    shell ignores them.
 
     A second one kills it: what it launched ends with it.
     """
+    ending = ending_signals()
 
     def interrupt(*_: object) -> NoReturn:
-        for number in _ENDING:
+        for number in ending:
             signal.signal(number, signal.SIG_DFL)
         raise KeyboardInterrupt
 
-    for number in _ENDING:
+    for number in ending:
         signal.signal(number, interrupt)
     try:
         yield

@@ -27,6 +27,7 @@ from protocol.endpoints import LOOPBACK, Endpoints, Mode
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
 from protocol.logs import LogFormat, about, configure_logs, logs_json
+from protocol.processes import ending_signals
 from protocol.slave import StartValue
 from protocol.standard_output import guard_standard_output
 from protocol.toml_text import toml_value
@@ -478,7 +479,7 @@ def _end_on_signals(end: Callable[[str], None]) -> None:
     def handle(number: int, _: FrameType | None) -> None:
         threading.Thread(target=end, args=(signal.Signals(number).name,), daemon=True).start()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in ending_signals():
         signal.signal(number, handle)
 
 

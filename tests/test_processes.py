@@ -29,6 +29,7 @@ import tomli_w
 from master_node import Result, load_system, simulate
 from master_node.cli import main
 from protocol.errors import ResultsError
+from protocol.processes import ending_signals
 from tests.quarter_car_case import DISPLACEMENT, EXAMPLES, global_errors
 
 pytestmark = [
@@ -147,7 +148,7 @@ def command(
     """``command("plot", ...)`` is ``master-node plot ...`` in this process: exit code and words."""
     monkeypatch.setenv("COLUMNS", "500")
     monkeypatch.setenv("MPLBACKEND", "Agg")
-    handler = signal.getsignal(signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in ending_signals()}
 
     def run(*words: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["master-node", *map(str, words)])
@@ -157,7 +158,8 @@ def command(
         return info.value.code, "".join(capfd.readouterr())
 
     yield run
-    signal.signal(signal.SIGTERM, handler)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 MainCommand = Callable[..., tuple[int, str]]
@@ -579,6 +581,7 @@ def test_a_step_beyond_the_deadline_ends_the_run(start: Start, tmp_path: Path) -
     [
         (signal.SIGINT, "launched"),
         (signal.SIGTERM, "launched"),
+        (signal.SIGHUP, "in process"),
         (signal.SIGINT, "in process"),
         (signal.SIGINT, "in a long step"),
         (signal.SIGTERM, "in a long step"),
