@@ -10,9 +10,12 @@
 from __future__ import annotations
 
 import json
+import lzma
 import os
 import shutil
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -32,6 +35,20 @@ _RUN_FILE = "run.zip"
 _RUN = "run.json"
 _VERSION = 1
 _LENGTH = Struct("<I")
+
+_MALFORMED = (  # all that damaged bytes become on the way through zipfile and json
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    EOFError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RuntimeError,
+)
 
 
 class SavedSlave(NamedTuple):
@@ -187,7 +204,7 @@ class CheckpointStore:
             ) from error
         except OSError as error:
             raise cannot_read(path, error) from error
-        except (zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError) as error:
+        except _MALFORMED as error:
             raise malformed(path, f"no checkpoint: {error}") from error
 
     def _path(self, name: str, calls: _CallsFile) -> Path:

@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -21,6 +21,8 @@ from protocol.credentials import Credentials, Role
 from protocol.endpoints import LOOPBACK
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
 from protocol.logs import LogFormat, about, configure_logs, logs_json
+from protocol.processes import ending_signals
+from protocol.standard_output import guard_standard_output
 
 if TYPE_CHECKING:  # each command imports what it needs
     from master_node.observers import Observer
@@ -40,7 +42,6 @@ log = logging.getLogger("master_node")
 
 _END_TIME = 5.0
 _TEXT_FORMAT = "%(levelname)s: %(message)s"
-_ENDING = (signal.SIGINT, signal.SIGTERM)
 
 Tls = Annotated[
     Path | None,
@@ -159,6 +160,19 @@ def run(  # noqa: PLR0917  options of the command line
     with _interruptible(), ExitStack() as stack:
         if stay_with_parent:
             _end_with_parent()
+        if in_process:
+            _refuse_beside_in_process(
+                {
+                    "--no-launch": no_launch,
+                    "--connect": connect,
+                    "--listen": listen,
+                    "--insecure": insecure,
+                    "--tls": tls,
+                    "--mode": mode,
+                    "--timeout": timeout is not None,
+                    "--pin": pin,
+                }
+            )
         from master_node.progress import (  # noqa: PLC0415  each command imports what it needs
             ProgressBar,
             UploadBar,
@@ -217,6 +231,15 @@ def run(  # noqa: PLR0917  options of the command line
         except KeyboardInterrupt:
             raise InterruptedRunError("interrupted before the first step") from None
         _show(output, quiet=quiet, no_plot=no_plot)
+
+
+def _refuse_beside_in_process(options: Mapping[str, object]) -> None:
+    given = [name for name, value in options.items() if value]
+    if given:
+        raise ConfigurationError(
+            f"{given[0]} is for slaves on the bus, and with --in-process there is none",
+            remedy=f"leave out {given[0]} or --in-process",
+        )
 
 
 def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
@@ -491,17 +514,19 @@ def _order(text: str | None) -> int | str | None:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the command with exit code 130, also where a shell ignores them.
+    """Ctrl-C, SIGTERM and SIGHUP end the command with exit code 130; the first two also where a
+    shell ignores them.
 
     A second one kills it: what it launched ends with it.
     """
+    ending = ending_signals()
 
     def interrupt(*_: object) -> NoReturn:
-        for number in _ENDING:
+        for number in ending:
             signal.signal(number, signal.SIG_DFL)
         raise KeyboardInterrupt
 
-    for number in _ENDING:
+    for number in ending:
         signal.signal(number, interrupt)
     try:
         yield
@@ -525,6 +550,7 @@ def _end_with_parent() -> None:
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
     configure_logs(LogFormat.TEXT, _TEXT_FORMAT)
+    guard_standard_output()
     try:
         app()
     except DoublestepError as error:

@@ -127,6 +127,13 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+_SHORTEST_TIME = 1e-30
+_LONGEST_TIME = 1e30
+"""Bounds of the simulated time [s]: fifth powers of step sizes have to be numbers."""
+
+_MAX_POINTS = 1e8
+"""How many results may be asked for by their interval."""
+
 _PAPER: Mapping[str, Any] = {
     "order": 1,
     "derivative_points": 0,
@@ -246,6 +253,16 @@ class SimulationSettings(_Table):
         if duration <= 0:
             raise ValueError(
                 f"stop_time {self.stop_time:g} must be after start_time {self.start_time:g}"
+            )
+        if not _SHORTEST_TIME <= duration <= _LONGEST_TIME:
+            raise ValueError(
+                f"{duration:g} s from start_time to stop_time cannot be computed with: between "
+                f"{_SHORTEST_TIME:g} and {_LONGEST_TIME:g} s can"
+            )
+        if self.output_interval is not None and self.output_interval * _MAX_POINTS < duration:
+            raise ValueError(
+                f"output_interval {self.output_interval:g} gives more than {_MAX_POINTS:g} result "
+                "points"
             )
         smallest, initial, largest = self.smallest, self.initial_step_size, self.largest_step_size
         if largest is not None and smallest > largest:
@@ -715,7 +732,11 @@ class System(_Table):
 
     def with_bus(self, **settings: Any) -> System:
         """The same system with other bus settings; None and empty ones leave one as it is."""
-        given = {name: value for name, value in settings.items() if value not in (None, (), False)}
+        given = {
+            name: value
+            for name, value in settings.items()
+            if value is not None and value is not False and value != ()
+        }
         return self._with(bus=self.bus.model_dump(exclude_unset=True) | given)
 
     def with_results(self, **settings: Any) -> System:
@@ -745,17 +766,21 @@ def load_system(path: Path | str) -> System:
 def configuration_error(
     source: str, error: ValidationError, known_keys: Callable[[list[str]], list[str]]
 ) -> ConfigurationError:
-    """All mistakes in a file, a line for each.
+    """The mistakes in a file, a line for each of the first hundred.
 
     Args:
         source: the file's name.
         error: what pydantic found.
         known_keys: the keys of the table at a place.
     """
-    sentences: dict[tuple[str, ...], str] = {}
+    mistakes: dict[tuple[str, ...], ErrorDetails] = {}
     for detail in error.errors():  # one sentence for all branches of a union
-        sentences.setdefault(_place(detail), _sentence(detail, known_keys))
-    return ConfigurationError("\n".join(f"{source}: {text}" for text in sentences.values()))
+        mistakes.setdefault(_place(detail), detail)
+    told = list(mistakes.values())[:_SHOWN_MISTAKES]
+    sentences = [_sentence(detail, known_keys) for detail in told]
+    if len(mistakes) > len(told):
+        sentences.append(f"and {len(mistakes) - len(told)} more mistakes")
+    return ConfigurationError("\n".join(f"{source}: {text}" for text in sentences))
 
 
 def _place(detail: ErrorDetails) -> tuple[str, ...]:
@@ -774,7 +799,7 @@ def _sentence(detail: ErrorDetails, known_keys: Callable[[list[str]], list[str]]
         return f"{_table(tables)}key {key!r} is missing"
     message = _WORDS.get(kind, detail["msg"].removeprefix("Value error, "))
     message = message[:1].lower() + message[1:]
-    if len(place) > 2 and place[2] == "parameters":
+    if len(place) > 3 and place[2] == "parameters":
         message = "must be a number, a boolean, a string or an array of them"
     if not place:
         return message
@@ -786,9 +811,11 @@ def _sentence(detail: ErrorDetails, known_keys: Callable[[list[str]], list[str]]
 
 _WORDS = {
     "model_type": "must be a table",
+    "dict_type": "must be a table",
     "mapping_type": "must be a table",
     "tuple_type": "must be an array",
 }
+_SHOWN_MISTAKES = 100
 _UNION_BRANCHES = frozenset(
     {
         *("float", "int", "bool", "str", "constrained-float", "constrained-int"),

@@ -21,11 +21,12 @@ from typing import NamedTuple
 import numpy as np
 
 from master_node.configuration import SlaveSettings, System
+from master_node.restorable_slave import BrokenStepError
 from master_node.slave_group import Program, SlaveGroup
 from master_node.step_size_rules import check_step_sizes
 from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import Configure, Examine, GetState, Reply, SetInputs, SetState
-from protocol.errors import ConfigurationError, FatalSlaveError, SlaveError
+from protocol.errors import ConfigurationError, FatalSlaveError, SlaveCrashedError, SlaveError
 from protocol.signals import MAX_ORDER, FloatArray
 from protocol.slave import (
     Examination,
@@ -153,9 +154,9 @@ def _judged(reply: Reply) -> Finding:
     if error is None:
         assert examination is not None
         return Finding(examination)
-    if not isinstance(error, SlaveError) or isinstance(error, FatalSlaveError):
+    if not isinstance(error, SlaveError) or isinstance(error, FatalSlaveError | SlaveCrashedError):
         raise error
-    if error.phase == SetInputs.verb:
+    if error.phase == SetInputs.verb and not isinstance(error, BrokenStepError):
         return Finding(Examination(), error.cause)
     if examination is None or examination.state_verdict is StateVerdict.EXACT:
         return Finding(Examination(StateVerdict.BROKEN, f"{error.phase}: {error.cause}"))

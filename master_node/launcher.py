@@ -21,6 +21,7 @@ class Starter(Protocol):
 
         Raises:
             ModelError: it ended because its model cannot be used.
+            SlaveCrashedError: its model crashed while it was loaded.
             SlaveLostError: it ended for any other reason.
         """
         ...

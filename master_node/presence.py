@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 
 from master_node.launcher import Starter
@@ -63,7 +63,7 @@ class Presence:
 
         Raises:
             SlaveLostError: a slave did not appear within ``timeout`` seconds; says what was found.
-            ModelError, SlaveLostError: one that was started ended.
+            ModelError, SlaveCrashedError, SlaveLostError: one that was started ended.
             ProtocolError: two slaves are found by one name.
         """
         deadline = self._clock.monotonic() + timeout
@@ -79,7 +79,7 @@ class Presence:
             if not missing:
                 return found
             if self._clock.monotonic() > deadline:
-                raise self._not_found(missing, alive, timeout)
+                raise self._not_found(missing, keys, alive, timeout)
             with self._changed:
                 self._changed.wait(_POLL_TIME)
 
@@ -117,7 +117,7 @@ class Presence:
                 if error is not None:
                     raise error
                 if self._clock.monotonic() > deadline:
-                    raise self._not_found([key.name], set(self._alive), timeout)
+                    raise self._not_found([key.name], {key.name}, set(self._alive), timeout)
                 self._changed.wait(_POLL_TIME)
 
     def follow(self, remote: RemoteSlave) -> None:
@@ -130,13 +130,19 @@ class Presence:
             remote.lost()
 
     @staticmethod
-    def _not_found(missing: list[str], alive: set[SlaveKey], timeout: float) -> SlaveLostError:
+    def _not_found(
+        missing: list[str], started: Collection[str], alive: set[SlaveKey], timeout: float
+    ) -> SlaveLostError:
         there = ", ".join(sorted({k.name for k in alive})) or "no slave at all"
+        loading = all(name in started for name in missing)
         return SlaveLostError(
             f"did not appear within {timeout:g} s; found on the bus: {there}",
             slave=", ".join(missing),
             phase="discovery",
-            remedy="start it with `slave-node serve MODEL --name NAME`, or check --connect "
+            remedy="its process was started and still loads the model: wait longer with --timeout, "
+            "or look into its log"
+            if loading
+            else "start it with `slave-node serve MODEL --name NAME`, or check --connect "
             "and --listen on both sides",
         )
 

@@ -19,6 +19,7 @@ from protocol.calls import (
     Configure,
     Describe,
     DeserializeState,
+    Examine,
     FreeState,
     GetState,
     Reply,
@@ -54,7 +55,8 @@ Restart = Callable[[], SlaveLink]
 
 
 class BrokenStepError(StepRejectedError):
-    """A step that ended the process of its slave, or had to be ended; the slave can be restored.
+    """A step, or trial steps, that ended the process of a slave, or had to be ended; the slave can
+    be restored.
 
     Attributes:
         original: what happened.
@@ -186,10 +188,10 @@ class RestorableSlave:
         self.log.note(self._calls, reply.results)
 
     def _can_be_broken(self, failure: DoublestepError) -> bool:
-        """Whether a smaller step may help."""
-        if self._restart is None or not self.log.is_running or not steps_taken(self._calls):
+        """Whether a smaller step may help, or the run can do without: it was on trial."""
+        if self._restart is None or not self.log.is_running or _is_lost(failure):
             return False
-        return not _is_lost(failure)
+        return bool(steps_taken(self._calls)) or any(type(c) is Examine for c in self._calls)
 
     def _locate(self, failure: DoublestepError) -> None:
         steps = steps_taken(self._calls)

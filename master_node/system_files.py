@@ -9,7 +9,6 @@ import logging
 import os
 import shutil
 import tempfile
-import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from master_node.ssp.writing import write_package
 from protocol.errors import ConfigurationError
 from protocol.keys import check_name
 from protocol.slave import SlaveDescription
+from protocol.toml_text import parse_toml
 
 log = logging.getLogger("master_node")
 
@@ -163,8 +163,8 @@ def _settings(structure: Structure, path: Path, notes: Notes) -> dict[str, dict[
     """The tables of our own annotation, with the times of the default experiment."""
     where = f"{path}: the annotation of Doublestep"
     try:
-        given = tomllib.loads(structure.settings)
-    except tomllib.TOMLDecodeError as error:
+        given = parse_toml(structure.settings)
+    except ValueError as error:
         raise ConfigurationError(f"{where} is not TOML: {error}") from None
     names = ("simulation", "slaves", "inputs", "results", "bus")
     tables = {name: given.pop(name, {}) for name in names}

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from protocol.errors import ConfigurationError
+from protocol.toml_text import parse_toml
+
+MAX_BYTES = 16 * 2**20
+"""What a file may hold: a thousand times what large systems need."""
 
 
 def read_tables(path: Path) -> dict[str, Any]:
     """The tables of a file.
 
     Raises:
-        ConfigurationError: the file cannot be read, or is not TOML.
+        ConfigurationError: the file cannot be read, is too large, or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    if len(data) > MAX_BYTES:
+        raise ConfigurationError(f"{path}: more than {MAX_BYTES} bytes, the limit of a system file")
+    try:
+        return parse_toml(data.decode("utf-8-sig"))
+    except ValueError as error:
         raise ConfigurationError(f"{path}: not a TOML file: {error}") from error
 
 

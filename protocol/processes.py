@@ -1,13 +1,23 @@
-"""Processes as the bus speaks of them: a host and a process id."""
+"""Processes as the bus speaks of them, a host and a process id; and what asks one to end."""
 
 from __future__ import annotations
 
 import os
+import signal
 import socket
 from contextlib import suppress
 from pathlib import Path
 
 _DEAD_STATES = frozenset("ZX")  # a zombie only waits for its parent to look
+
+
+def ending_signals() -> list[signal.Signals]:
+    """Those that ask a command to end; SIGHUP, of a terminal that is gone, not under ``nohup``."""
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
+    if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
+        numbers.append(hang_up)
+    return numbers
 
 
 def has_ended(host: str, pid: int) -> bool:

@@ -18,7 +18,13 @@ from time import monotonic
 from typing import Final
 
 from protocol.endpoints import Endpoints, Mode
-from protocol.errors import ConfigurationError, DoublestepError, ModelError, SlaveLostError
+from protocol.errors import (
+    ConfigurationError,
+    DoublestepError,
+    ModelError,
+    SlaveCrashedError,
+    SlaveLostError,
+)
 from protocol.keys import SlaveKey
 
 _END_TIME = 2.0
@@ -60,11 +66,12 @@ class SlaveProcess:
         processor: int | None = None,
         goes_on: bool = False,
     ) -> None:
-        command = [sys.executable, "-m", "slave_node", "serve", model]
+        command = [sys.executable, "-m", "slave_node", "serve"]
         command += ["--base", str(base), "--name", key.name, "--instance", key.instance]
         command += [*connection, "--stay-with-parent"]
         if processor is not None:
             command += ["--processor", str(processor)]
+        command += ["--", model]  # which may begin with a dash
         self.key = key
         self.log = log
         try:
@@ -154,13 +161,16 @@ def end_error(name: str, exit_code: int, lines: Sequence[str], remedy: str) -> D
     """Why the process of slave ``name`` ended, from its exit code and last lines.
 
     Returns:
-        A `ModelError` when its model cannot be used, else a `SlaveLostError`.
+        A `ModelError` when its model cannot be used, a `SlaveCrashedError` when its model crashed
+        while it was loaded, else a `SlaveLostError`.
     """
     errors = [line for line in lines if line.startswith(_ERROR)]
     words = errors[-1:] or lines[-_SHOWN_LINES:]
     last = " | ".join(word.removeprefix(_ERROR) for word in words) or "nothing"
     if exit_code == _USAGE_EXIT_CODE:
         return ModelError(last, slave=name)
+    if exit_code == SlaveCrashedError.exit_code:
+        return SlaveCrashedError(last, slave=name, phase="load", remedy=remedy)
     how = describe_exit(exit_code)
     return SlaveLostError(f"its process {how}; its log ends: {last}", slave=name, remedy=remedy)
 

@@ -11,7 +11,6 @@ import socket
 import sys
 import tempfile
 import threading
-import tomllib
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -29,7 +28,10 @@ from protocol.endpoints import LOOPBACK, Endpoints, Mode
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
 from protocol.logs import LogFormat, about, configure_logs, logs_json
+from protocol.processes import ending_signals
 from protocol.slave import StartValue
+from protocol.standard_output import guard_standard_output
+from protocol.toml_text import toml_value
 
 if TYPE_CHECKING:
     from slave_node.worker import Worker
@@ -461,10 +463,7 @@ def _parameters(assignments: list[str]) -> dict[str, StartValue]:
         name, equals, text = assignment.partition("=")
         if not equals or not name:
             raise ConfigurationError(f"--parameter {assignment}: write name=value")
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            value = text
+        value = toml_value(text)
         if not isinstance(value, float | int | bool | str):
             raise ConfigurationError(f"--parameter {assignment}: not a number, boolean or string")
         values[name.strip()] = value
@@ -489,7 +488,7 @@ def _end_on_signals(end: Callable[[str], None]) -> None:
     def handle(number: int, _: FrameType | None) -> None:
         threading.Thread(target=end, args=(signal.Signals(number).name,), daemon=True).start()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in ending_signals():
         signal.signal(number, handle)
 
 
@@ -506,6 +505,7 @@ def _end_with_parent(end: Callable[[str], None]) -> None:
 
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
+    guard_standard_output()
     try:
         app()
     except DoublestepError as error:

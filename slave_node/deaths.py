@@ -7,7 +7,7 @@ import signal
 from protocol.errors import SlaveCrashedError, SlaveKilledError
 
 _FROM_OUTSIDE = frozenset(
-    getattr(signal, name)
+    int(getattr(signal, name))
     for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT")
     if hasattr(signal, name)
 )
@@ -27,8 +27,14 @@ def death(exit_code: int | None) -> SlaveCrashedError:
     if exit_code is not None and exit_code >= 0:
         how = f"ended with exit code {exit_code}"
     elif exit_code is not None:
-        number = signal.Signals(-exit_code)
-        how = f"died by {number.name}"
-        if number in _FROM_OUTSIDE:
+        how = f"died by {_name(-exit_code)}"
+        if -exit_code in _FROM_OUTSIDE:
             kind = SlaveKilledError
     return kind(f"the process that held the model {how}")
+
+
+def _name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # a real-time signal
+        return f"signal {number}"

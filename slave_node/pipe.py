@@ -7,6 +7,7 @@ one, into a buffer that is kept: beside a step of some microseconds calls and bu
 from __future__ import annotations
 
 import socket
+from contextlib import suppress
 from multiprocessing.connection import wait
 from struct import Struct
 
@@ -67,6 +68,11 @@ class Pipe:
     def has_message(self, timeout: float) -> bool:
         """Whether a message, or the end, comes within ``timeout`` seconds."""
         return bool(wait([self._socket], timeout))
+
+    def hang_up(self) -> None:
+        """End a wait for a message that will not come. From any thread."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Close this end. Idempotent."""

@@ -19,6 +19,7 @@ import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Protocol
 
@@ -109,8 +110,9 @@ class WorkerProcess:
     def __init__(self, reference: ModelReference, load_time: float = 60.0) -> None:
         self._reference = reference
         self._load_time = load_time
-        self._process: multiprocessing.process.BaseProcess | None = None
+        self._process: BaseProcess | None = None
         self._pipe: Pipe | None = None
+        self._guard: threading.Thread | None = None
         self._scratch: str | None = None
         self._using = threading.Lock()
         """Held while the pipe is in use; ``kill`` needs none and makes the holder let go."""
@@ -136,6 +138,7 @@ class WorkerProcess:
         )
         self._process.start()
         theirs.close()
+        self._guard = _start_guard(self._process, self._pipe)
         try:
             if not self._pipe.has_message(self._load_time):
                 raise DeadlineError(
@@ -185,13 +188,14 @@ class WorkerProcess:
             if self._pipe is not None and self._process is not None:
                 with suppress(OSError):
                     self._pipe.send(_END)
-                    self._process.join(_CLOSE_TIME)
+                    self._wait_ended(self._process)
             self._discard()
         finally:
             self._using.release()
 
     def _crashed(self) -> SlaveCrashedError:
         assert self._process is not None
+        self._wait_ended(self._process)
         self._process.join(_CLOSE_TIME)
         code = self._process.exitcode
         self._discard()
@@ -199,10 +203,10 @@ class WorkerProcess:
 
     def _discard(self) -> None:
         if self._process is not None:
-            if self._process.is_alive():
-                self._process.kill()
+            self._process.kill()
+            self._wait_ended(self._process)
             self._process.join(_CLOSE_TIME)
-            self._process = None
+            self._process = self._guard = None
         if self._pipe is not None:
             self._pipe.close()
             self._pipe = None
@@ -210,10 +214,39 @@ class WorkerProcess:
             shutil.rmtree(self._scratch, ignore_errors=True)
             self._scratch = None
 
+    def _wait_ended(self, process: BaseProcess) -> None:
+        """For a short time; the guard is done before the process is reaped and its id free."""
+        if self._guard is None:
+            process.join(_CLOSE_TIME)
+        else:
+            self._guard.join(_CLOSE_TIME)
+
+
+def _start_guard(process: BaseProcess, pipe: Pipe) -> threading.Thread | None:
+    """Look after what a model has started: it ends with the worker.
+
+    Such processes hold the worker's end of the pipe, so that its death could not be seen there.
+    """
+    if sys.platform != "linux" or process.pid is None:
+        return None
+    guard = threading.Thread(target=_end_with, args=(process.pid, pipe), name="guard", daemon=True)
+    guard.start()
+    return guard
+
+
+def _end_with(worker: int, pipe: Pipe) -> None:
+    with suppress(ChildProcessError):
+        os.waitid(os.P_PID, worker, os.WEXITED | os.WNOWAIT)
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(worker, signal.SIGKILL)
+    pipe.hang_up()
+
 
 def _main(end: socket.socket, reference: ModelReference, scratch: str) -> None:
     """Load the model, then execute programs until the node says end or is gone."""
     _die_with_parent()
+    if sys.platform == "linux":
+        os.setsid()  # what the model starts is in this group, see `_start_guard`
     pipe = Pipe(end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

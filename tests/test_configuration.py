@@ -16,7 +16,9 @@ from master_node.configuration import OutputTolerance, SlaveSettings
 from master_node.numerics.extrapolation import InputPolynomial
 from master_node.simulation import settings_of
 from master_node.slaves import slaves_on_bus
+from master_node.toml_files import MAX_BYTES
 from protocol.errors import ConfigurationError
+from protocol.toml_text import toml_value
 from tests.quarter_car_case import EXAMPLES
 
 SYSTEM = """
@@ -467,11 +469,32 @@ def test_wrong_values_are_named_with_what_is_allowed(
             'constants = "paper"\nsequence = "gauss-seidel"',
             'constants = "paper" hold for sequence = "jacobi" only',
         ),
+        (
+            "output_interval = 1e-12",
+            "output_interval 1e-12 gives more than 1e+08 result points",
+        ),
+        (
+            "start_time = -1e40",
+            "1e+40 s from start_time to stop_time cannot be computed with: between 1e-30 and "
+            "1e+30 s can",
+        ),
+        (
+            "start_time = -1.7e308\nstop_time = 1.7e308",
+            "inf s from start_time to stop_time cannot be computed with: between 1e-30 and "
+            "1e+30 s can",
+        ),
+        (
+            "stop_time = 1e-300",
+            "1e-300 s from start_time to stop_time cannot be computed with: between 1e-30 and "
+            "1e+30 s can",
+        ),
     ],
 )
 def test_values_that_contradict_each_other(tmp_path: Path, lines: str, words: str) -> None:
     """Both keys are named with both values."""
-    assert refusal(tmp_path, simulation(lines)) == f"[simulation] {words}"
+    text = SYSTEM.replace("stop_time = 4.0\n", "") if "stop_time = " in lines else SYSTEM
+    text = text.replace("[simulation]", f"[simulation]\n{lines}")
+    assert refusal(tmp_path, text) == f"[simulation] {words}"
 
 
 @pytest.mark.parametrize(
@@ -488,6 +511,8 @@ def test_values_that_contradict_each_other(tmp_path: Path, lines: str, words: st
         ('[slaves.a]\nsha256 = "' + 64 * "g" + '"', "write 64 hexadecimal digits"),
         ('simulation = "x"\n[slaves.a]', "simulation = 'x': must be a table"),
         ("[slaves.a]\nmodel = 3", "[slaves.a] model = 3: "),
+        ("[slaves.a]\nparameters = nan", "[slaves.a] parameters = nan: must be a table"),
+        ("[slaves.a]\nrequires = 0.0", "[slaves.a] requires = 0.0: must be a table"),
         (
             "[slaves.a]\nparameters = { m = [{}] }",
             "[slaves.a.parameters] m = [{}]: must be a number, a boolean, a string or an array",
@@ -577,6 +602,57 @@ def test_endpoints_are_checked_before_anything_starts(
     with pytest.raises(ConfigurationError, match=expected), slaves_on_bus(system, tmp_path):
         pytest.fail("it started")
     assert list(tmp_path.glob("*.log")) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x = " + "[" * 100_000, "not a TOML file: it is nested too deeply"),
+        ("x = " + "{a=" * 100_000, "not a TOML file: it is nested too deeply"),
+        ("x = " + "9" * 5000, "not a TOML file: "),
+        (f"x = '{'a' * MAX_BYTES}'", f"more than {MAX_BYTES} bytes"),
+    ],
+    ids=["arrays", "tables", "a number", "a file"],
+)
+def test_what_is_beyond_all_measure_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    """Depth, digits and bytes have limits, and reaching one is a mistake as any other."""
+    assert refusal(tmp_path, text).startswith(words)
+
+
+def test_mistakes_without_number_are_counted(tmp_path: Path) -> None:
+    """The first hundred are told, of the others how many there are."""
+    lines = refusal(tmp_path, "\n".join(f"k{i} = 0" for i in range(1000)) + "\n" + SYSTEM)
+    told = lines.splitlines()
+    assert len(told) == 101
+    assert told[-1] == "and 900 more mistakes"
+
+
+def test_a_byte_order_mark_is_no_mistake(tmp_path: Path) -> None:
+    """Some editors put one in front of the file."""
+    assert load_system(written(tmp_path, "\ufeff" + SYSTEM)).simulation.stop_time == 4.0
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1", 1),
+        ("1e-3", 1e-3),
+        ("true", True),
+        ("'1'", "1"),
+        ("", ""),
+        ("red", "red"),
+        ("3 # 4", "3 # 4"),
+        ("3\nx = 4", "3\nx = 4"),
+        ("3, x = 4", "3, x = 4"),
+        ("3 }", "3 }"),
+        ("[" * 100_000, "[" * 100_000),
+        ("9" * 5000, "9" * 5000),
+    ],
+)
+def test_a_text_is_a_value_as_a_whole_or_itself(text: str, value: object) -> None:
+    """Nothing of a text is passed over to make a number of the rest."""
+    assert toml_value(text) == value
+    assert type(toml_value(text)) is type(value)
 
 
 @given(st.text(max_size=200))

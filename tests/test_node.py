@@ -61,6 +61,7 @@ from protocol.keys import (
     alive_master,
     alive_slaves,
 )
+from protocol.processes import has_ended
 from protocol.slave import SlaveDescription
 from protocol.zenoh_bus import ZenohBus
 from slave_node.node import SlaveNode
@@ -129,6 +130,29 @@ class Slow(Integrator):
                 pipe.read()
         return [self.rate]
 '''
+
+
+HELPED = """
+import os
+import signal
+import time
+from pathlib import Path
+from slave_node.model import Model, real
+
+child = os.fork()
+if child:
+    Path(__file__).with_name("helper").write_text(str(child))
+else:
+    time.sleep(60.0)
+    os._exit(0)
+
+class Helped(Model):
+    states = (real("x"),)
+    outputs = states
+
+    def derivatives(self, t, x, u):
+        os.kill(os.getpid(), signal.SIGSEGV)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -597,6 +621,29 @@ def test_abort_ends_an_endless_step(
     assert master.status()["worker"] == "dead"
     master.release()
     served.master("run-2").claim().start().release()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere it cannot be told")
+@pytest.mark.parametrize("end", ["crash", "stop"])
+def test_what_a_model_has_started_ends_with_it(end: str, tmp_path: Path) -> None:
+    """A program beside the model holds the worker's end of the pipe: the crash is seen all the
+    same, with its signal, and the program does not outlive the worker.
+    """
+    file = tmp_path / "helped.py"
+    file.write_text(HELPED)
+    worker = WorkerProcess(ModelReference(f"{file}:Helped", tmp_path, "x"))
+    worker.start()
+    helper = int((tmp_path / "helper").read_text())
+    assert not has_ended(socket.gethostname(), helper)
+    if end == "crash":
+        with pytest.raises(SlaveCrashedError, match="died by SIGSEGV"):
+            worker.execute(
+                encode_program(
+                    [Initialize(outputs=("x",)), ExitInitializationMode(), DoStep(0.0, 0.1)]
+                )
+            )
+    worker.stop()
+    wait_until(lambda: has_ended(socket.gethostname(), helper))
 
 
 # ---- Masters that vanish -----------------------------------------------------------------------

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,12 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import tomli_w
 
 from master_node import Result, load_system, simulate
 from master_node.cli import main
 from protocol.errors import ResultsError
+from protocol.processes import ending_signals
 from tests.quarter_car_case import DISPLACEMENT, EXAMPLES, global_errors
 
 pytestmark = [
@@ -145,7 +148,7 @@ def command(
     """``command("plot", ...)`` is ``master-node plot ...`` in this process: exit code and words."""
     monkeypatch.setenv("COLUMNS", "500")
     monkeypatch.setenv("MPLBACKEND", "Agg")
-    handler = signal.getsignal(signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in ending_signals()}
 
     def run(*words: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["master-node", *map(str, words)])
@@ -155,7 +158,8 @@ def command(
         return info.value.code, "".join(capfd.readouterr())
 
     yield run
-    signal.signal(signal.SIGTERM, handler)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 MainCommand = Callable[..., tuple[int, str]]
@@ -577,6 +581,7 @@ def test_a_step_beyond_the_deadline_ends_the_run(start: Start, tmp_path: Path) -
     [
         (signal.SIGINT, "launched"),
         (signal.SIGTERM, "launched"),
+        (signal.SIGHUP, "in process"),
         (signal.SIGINT, "in process"),
         (signal.SIGINT, "in a long step"),
         (signal.SIGTERM, "in a long step"),
@@ -749,6 +754,32 @@ def test_an_fmu_that_cannot_be_used(
     assert "Traceback" not in master.text
 
 
+@pytest.mark.parametrize(
+    ("model", "timeout", "code", "words"),
+    [
+        ("--help", "30", 2, "chassis: '--help' is not a model"),
+        ("aborts.py:Model", "30", 4, "chassis: load: the process that held the model died by"),
+        ("sleeps.py:Model", "3", 3, "its process was started and still loads the model"),
+    ],
+)
+def test_a_model_that_does_not_get_loaded(  # noqa: PLR0917
+    model: str, timeout: str, code: int, words: str, start: Start, tmp_path: Path
+) -> None:
+    """A name is never an option of the slave's command; who crashes while it is loaded is told
+    from who is lost, and who takes too long from who was not started.
+    """
+    (tmp_path / "aborts.py").write_text("import os\nos.abort()\n")
+    (tmp_path / "sleeps.py").write_text("import time\ntime.sleep(60)\n")
+    file = system_file(tmp_path)
+    tables = tomllib.loads(file.read_text())
+    tables["slaves"]["chassis"] = {"model": model}
+    file.write_text(tomli_w.dumps(tables))
+    options = ("--timeout", timeout, "--output", tmp_path / "out")
+    master = start("master_node", "run", file, *options)
+    assert master.wait() == code, master.text
+    assert words in master.text.splitlines()[-1]
+
+
 def test_a_misspelt_variable(start: Start, tmp_path: Path) -> None:
     """Exit code 2 with the file, the connection and the nearest name; no step is taken."""
     file = system_file(tmp_path, connections=[*DISPLACEMENT[:3], ("wheel.v", "chassis.vw")])
@@ -783,6 +814,9 @@ def test_an_output_directory_that_cannot_be_written(start: Start, tmp_path: Path
         (["--estimator", "richardson"], "'rich', 'mod' or 'none'"),
         (["--listen", "7447"], "'7447' is not an endpoint"),
         (["--listen", "tcp/0.0.0.0:7447"], "--insecure"),
+        (["--timeout", "0"], "discovery_timeout = 0.0"),
+        (["--in-process", "--no-launch"], "leave out --no-launch or --in-process"),
+        (["--in-process", "--timeout", "0"], "--timeout is for slaves on the bus"),
     ],
 )
 def test_a_wrong_command_line(
@@ -793,3 +827,39 @@ def test_a_wrong_command_line(
     assert code == 2
     assert message in text
     assert not (tmp_path / "out" / "results.csv").exists()
+
+
+# ---- Who reads what a command says --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("module", ["master_node", "slave_node"])
+def test_a_reader_that_has_left_changes_nothing(module: str) -> None:
+    """As with ``| head``: no message and the same exit code, as 1 has a meaning."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as closed:
+        done = subprocess.run(
+            [sys.executable, "-m", module, "--help"],
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            timeout=BOUND,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
+@pytest.mark.parametrize("module", ["master_node", "slave_node"])
+def test_an_output_that_cannot_be_written(module: str) -> None:
+    """Exit code 7 and one line."""
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", module, "--help"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            timeout=BOUND,
+            check=False,
+        )
+    assert done.returncode == 7
+    assert b"cannot write to the standard output: No space left" in done.stderr
+    assert len(done.stderr.splitlines()) == 1

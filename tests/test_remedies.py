@@ -15,12 +15,19 @@ import pytest
 from master_node import System, simulate
 from master_node.configure_slaves import configure
 from master_node.preparation import Prepared, prepare
+from master_node.restorable_slave import RestorableSlave
 from master_node.simulation import run
 from master_node.slave_group import SlaveGroup
-from master_node.slave_link import LocalSlave
+from master_node.slave_link import LocalSlave, SlaveLink
 from master_node.step_size_rules import with_fixed_steps
-from protocol.calls import Configure, StepResult
-from protocol.errors import ConfigurationError, ModelError, SlaveError, StepSizeError
+from protocol.calls import Configure, Reply, StepResult
+from protocol.errors import (
+    ConfigurationError,
+    ModelError,
+    SlaveCrashedError,
+    SlaveError,
+    StepSizeError,
+)
 from protocol.slave import Examination, InputDerivatives, Slave, StateKind, StateVerdict
 from slave_node.executor import Executor
 from slave_node.substeps import with_substeps
@@ -47,6 +54,28 @@ Make = Callable[[], TimedSlave]
 HELD = replace(ALL, can_interpolate_inputs=False)
 
 
+class CrashingSlave(TimedSlave):
+    """Takes its process along when its state is to be saved."""
+
+    def get_state(self) -> object:
+        """See `Slave`."""
+        raise SlaveCrashedError("died by SIGSEGV")
+
+
+class MortalLink(LocalSlave):
+    """Behind a crash there is nobody any more."""
+
+    _has_crashed = False
+
+    def finish(self) -> Reply:
+        """See `SlaveLink`."""
+        if self._has_crashed:
+            return Reply([], SlaveCrashedError("the process that held the model is gone"), 0.0)
+        reply = super().finish()
+        self._has_crashed = isinstance(reply.error, SlaveCrashedError)
+        return reply
+
+
 class Workshop:
     """Loads slaves in any configuration, as slave nodes do, and counts what happens to them.
 
@@ -68,7 +97,9 @@ class Workshop:
             "chassis": Executor(self.load(Configure()), self.load),
             "wheel": Executor(wheel),
         }
-        self.links = {name: LocalSlave(executor) for name, executor in self.executors.items()}
+        self.links: dict[str, SlaveLink] = {
+            name: LocalSlave(executor) for name, executor in self.executors.items()
+        }
         self.group = SlaveGroup(self.links)
 
     def load(self, configuration: Configure) -> Slave:
@@ -146,6 +177,31 @@ def test_states_that_cannot_be_trusted_are_saved_in_another_way(
     else:
         assert prepared.outputs is not None  # from the round that found nothing wrong
         assert last is StateVerdict.EXACT
+
+
+@pytest.mark.parametrize("recovers", [True, False])
+def test_a_crash_on_trial(recovers: bool) -> None:
+    """Where the slave can be started again, the next way to save its states is taken; else the
+    crash is the error, and not what cannot be done afterwards.
+    """
+    workshop = Workshop({"native": CrashingSlave, "fork": TimedSlave})
+    crashed = workshop.executors["chassis"]
+
+    def restart() -> LocalSlave:
+        return LocalSlave(Executor(workshop.load(Configure()), workshop.load))
+
+    workshop.links["chassis"] = RestorableSlave(
+        "chassis", MortalLink(crashed), crashed.description, restart if recovers else None
+    )
+    workshop.group = SlaveGroup(workshop.links)
+    if recovers:
+        prepared = workshop.prepare()
+        assert prepared.descriptions["chassis"].state_kind == "fork"
+        (warning,) = prepared.warnings
+        assert "cannot be trusted: get_state: died by SIGSEGV; fork instead" in warning
+    else:
+        with pytest.raises(SlaveCrashedError, match=r"^chassis: get_state.*: died by SIGSEGV$"):
+            workshop.prepare()
 
 
 def test_a_solver_that_restarts_is_named_and_accepted() -> None:

@@ -213,7 +213,7 @@ def test_a_slave_says_when_it_is_ready(start: Start, fmu_dir: Path, bus: ZenohBu
     assert status["state"] == "free"
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_ends_it_orderly(
     start: Start, fmu_dir: Path, scratch: Path, number: signal.Signals
 ) -> None:

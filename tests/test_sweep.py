@@ -36,6 +36,7 @@ from master_node.study.directory import StudyDirectory
 from master_node.study.plan import PlannedRun, make_plan
 from master_node.study.records import RunRecord, read_record, write_record
 from protocol.errors import ConfigurationError, ResultsError
+from protocol.processes import ending_signals
 from tests.quarter_car_case import DISPLACEMENT, EXAMPLES
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="uses signals")
@@ -410,7 +411,7 @@ def sweep(file: Path, output: Path, *words: object, in_this_process: bool = Fals
         from master_node.cli import app  # noqa: PLC0415
         from protocol.errors import DoublestepError  # noqa: PLC0415
 
-        kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        kept = {number: signal.getsignal(number) for number in ending_signals()}
         try:
             result = CliRunner().invoke(app, arguments)
         finally:

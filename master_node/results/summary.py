@@ -111,6 +111,8 @@ def read_json(path: Path) -> dict[str, Any]:
         return {}
     except json.JSONDecodeError as error:
         raise malformed(path, error.msg, error.lineno) from error
+    except (ValueError, RecursionError) as error:  # a number or a depth beyond what can be read
+        raise malformed(path, str(error)) from error
     except OSError as error:
         raise cannot_read(path, error) from error
     if not isinstance(tables, dict):

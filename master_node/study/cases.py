@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import tomllib
 from collections.abc import Iterator
 from itertools import islice, product
 from math import isfinite, prod
@@ -23,6 +22,7 @@ from master_node.study.configuration import (
     Study,
 )
 from protocol.errors import ConfigurationError
+from protocol.toml_text import toml_value
 
 
 def cases_of(study: Study) -> tuple[Case, ...]:
@@ -139,10 +139,7 @@ def _rows(path: Path, rows: Iterator[list[str]], names: list[str]) -> Iterator[C
 
 def _cell(path: Path, number: int, name: str, text: str) -> Scalar:
     """The value in TOML's notation; what is none is a string."""
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+    value = toml_value(text)
     if not isinstance(value, bool | int | float | str):
         raise ConfigurationError(
             f"{path}, line {number}: {name} = {text}: must be a number, a boolean or a string"

@@ -49,7 +49,7 @@ def read_record(directory: Path) -> RunRecord | None:
     """Read ``run.json``; None where there is none or it is broken, so that the run is repeated."""
     try:
         known = json.loads((directory / RECORD_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     types = {"fingerprint": str, "exit_code": int, "message": str, "wall_time": float}
     if (
