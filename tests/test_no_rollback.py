@@ -695,7 +695,7 @@ def test_single_steps_end_exactly_on_their_target(
     while time < target:
         time, size = limits.step(begin, time, wanted, target)
         sizes.append(size)
-        assert size <= wanted * (1.0 + 1e-12)
+        assert size <= wanted
     assert time == target
     assert min(sizes) >= min(wanted, duration) / 2.0 * (1.0 - 1e-9)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
@@ -13,6 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System
+from master_node.numerics.double_step_times import step_end
 from master_node.numerics.step_size_limits import (
     SlaveLimits,
     StepSizeLimits,
@@ -241,6 +243,18 @@ def test_slaves_keep_up_with_the_time(rollback: bool) -> None:
     states = np.stack([found.result[name] for name in STATES], axis=1)
     exact = exact_solution(found.result.time - 1.7e9)
     assert np.abs(states - exact).max() < 1e-5
+
+
+@given(st.floats(-2e9, 2e9), st.floats(1e-6, 1e3))
+def test_a_step_is_the_way_to_its_end_and_not_above_h(begin: float, step_size: float) -> None:
+    """Law: who adds up sizes has the time, to twelve digits of H, and a slave that may take no more
+    than H is never asked to; H is halved at most, where numbers are as far apart as it is long.
+    """
+    end, size = step_end(begin, step_size)
+    assert begin < end
+    assert abs((end - begin) - size) <= 1e-12 * step_size
+    assert size <= step_size or end == math.nextafter(begin, math.inf)
+    assert size > 0.5 * step_size
 
 
 class OnTime(LinearSlave):

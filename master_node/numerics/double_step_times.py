@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import nextafter
 from typing import NamedTuple
 
 
@@ -14,7 +15,7 @@ class DoubleStepTimes(NamedTuple):
     Attributes:
         begin, middle, end: communication points [s].
         first, second: sizes of the small steps [s]; both are H but for the rounding of the times.
-            See `size_between`.
+            See `step_end`.
     """
 
     begin: float
@@ -28,23 +29,28 @@ class DoubleStepTimes(NamedTuple):
         begin: float, step_size: float, stop_time: float | None = None
     ) -> DoubleStepTimes:
         """Two steps of H [s]; with ``stop_time`` the second ends exactly there."""
-        middle = begin + step_size
-        first = size_between(begin, middle, step_size)
-        if stop_time is None:
-            end = middle + step_size
-            return DoubleStepTimes(begin, middle, end, first, size_between(middle, end, step_size))
-        return DoubleStepTimes(begin, middle, stop_time, first, stop_time - middle)
+        middle, first = step_end(begin, step_size)
+        if stop_time is not None:
+            return DoubleStepTimes(begin, middle, stop_time, first, stop_time - middle)
+        end, second = step_end(middle, step_size)
+        return DoubleStepTimes(begin, middle, end, first, second)
 
 
-def size_between(begin: float, end: float, step_size: float) -> float:
-    """The size of a step of H between times [s] of which one is the other + H, but for rounding.
+def step_end(begin: float, step_size: float) -> tuple[float, float]:
+    """Where a step of H from ``begin`` ends [s], and its size, which is not above H.
 
     Far from t = 0 rounding moves T + H by up to a percent of H, the same way in step after step of
-    the same H. Slaves that took H would get ahead of the time or fall behind it, so there it is the
-    difference of the times. Where that is H to twelve digits it is H as it was given.
+    the same H. Slaves that took H would get ahead of the time or fall behind it, so there the size
+    is the difference of the times. Where that is H to twelve digits it is H as it was given.
     """
-    difference = end - begin
-    return step_size if abs(difference - step_size) <= _NEGLIGIBLE * step_size else difference
+    end = begin + step_size
+    size = end - begin
+    if abs(size - step_size) <= _NEGLIGIBLE * step_size:
+        return end, step_size
+    before = nextafter(end, begin)
+    if size > step_size and before > begin:  # a slave may take no more than H
+        return before, before - begin
+    return end, size
 
 
 _NEGLIGIBLE = 1e-12

@@ -8,7 +8,7 @@ from fractions import Fraction
 from math import ceil, lcm, ulp
 from typing import NamedTuple, TypeVar
 
-from master_node.numerics.double_step_times import DoubleStepTimes, size_between
+from master_node.numerics.double_step_times import DoubleStepTimes, step_end
 from master_node.numerics.step_size_controller import last_step_size
 
 _ROUNDING = 1e-10
@@ -214,10 +214,7 @@ class StepSizeLimits:
             size = left if step_size >= left else min(step_size, left / 2.0)
             rounding = self._rounding(begin, target)
             size = _planned(size, left, self.smallest, self.largest, rounding)
-            if size >= left:
-                return target, left
-            end = begin + size
-            return end, size_between(begin, end, size)
+            return (target, left) if size >= left else step_end(begin, size)
         quantum, zero = self.quantum, _decimal(origin)
         done = self._units(origin, begin)
         units_left = self._units(origin, target) - done
@@ -264,9 +261,9 @@ class StepSizeLimits:
         """
         size = self.smallest
         if self.quantum is None:
-            begin, end = event - size, event + size
-            first, second = size_between(begin, event, size), size_between(event, end, size)
-            return DoubleStepTimes(begin, event, end, first, second)
+            mirrored, first = step_end(-event, size)
+            end, second = step_end(event, size)
+            return DoubleStepTimes(-mirrored, event, end, first, second)
         zero, step = _decimal(origin), _decimal(size)
         pair = 2 * step
         last = zero + pair * ceil((_decimal(event) - zero) / pair)

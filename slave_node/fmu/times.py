@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 
-SLACK = 1e-6
+SLACK = 1e-4
 """The part of a step by which an event moves that is located again in a step that ends there."""
 
 _LOCATED = 200.0 * sys.float_info.epsilon
