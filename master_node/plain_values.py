@@ -70,6 +70,7 @@ def from_plain(kind: type[_T], plain: Any) -> _T:
 
 
 def _built(kind: Any, plain: Any) -> Any:
+    kind = _expanded(kind)
     origin = get_origin(kind)
     kinds = get_args(kind)
     if origin is Union or origin is UnionType:
@@ -89,6 +90,15 @@ def _built(kind: Any, plain: Any) -> Any:
     else:
         value = _leaf(plain)
     return value
+
+
+def _expanded(kind: Any) -> Any:
+    """What an alias stands for; ``NDArray`` is one since NumPy 2.5, from Python 3.12 on."""
+    alias = get_origin(kind) or kind
+    if not hasattr(alias, "__value__"):
+        return kind
+    arguments = get_args(kind)
+    return alias.__value__[arguments] if arguments else alias.__value__
 
 
 def _of_union(kinds: tuple[Any, ...], plain: Any) -> Any:

@@ -8,11 +8,13 @@ import shutil
 import signal
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
+from typing_extensions import TypeAliasType
 
 from master_node import Result, System, load_system, resume, simulate
 from master_node.controlled_run import Position
@@ -293,6 +295,26 @@ def test_a_position_reads_back_to_the_same_bits() -> None:
     )
     again = from_plain(Position, json.loads(json.dumps(to_plain(position))))
     assert_same(again, position)
+
+
+_T = TypeVar("_T", bound=np.generic)
+Matrix = TypeAliasType("Matrix", np.ndarray[tuple[int, int], np.dtype[_T]], type_params=(_T,))
+Floats = TypeAliasType("Floats", np.ndarray[tuple[int, int], np.dtype[np.float64]])
+
+
+@dataclass(frozen=True)
+class Aliased:
+    """Its annotations are names for types, as ``NDArray`` is from NumPy 2.5 on."""
+
+    values: Matrix[np.float64]
+    others: Floats
+
+
+def test_names_of_types_are_the_types() -> None:
+    """With NumPy 2.5 on Python 3.12 no checkpoint was read."""
+    value = Aliased(np.array([[1.0, -0.0]]), np.array([[np.inf]]))
+    again = from_plain(Aliased, json.loads(json.dumps(to_plain(value))))
+    assert_same((again.values, again.others), (value.values, value.others))
 
 
 def assert_same(a: Any, b: Any) -> None:
