@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.quarter_car import ESTIMATORS, EXAMPLE
+from benchmarks.quarter_car import ESTIMATOR_NAMES, EXAMPLE
 from examples.capabilities.build import FMUS
 from examples.fmu_framework.build_fmus import build
 from examples.quarter_car.quarter_car import exact_solution
@@ -67,7 +67,7 @@ def run() -> list[tuple[str, ...]]:
             runs = [_measured(system) for system in (native, emulated, held)]
             rows.append(
                 (
-                    f"{ESTIMATORS[estimator]}, k = {order}, RTOL {tolerance:g}",
+                    f"{ESTIMATOR_NAMES[estimator]}, k = {order}, RTOL {tolerance:g}",
                     " / ".join(str(run.steps) for run in runs),
                     " / ".join(f"{run.error:.2e}" for run in runs),
                     " / ".join(f"{1e6 * run.time:.0f} us" for run in runs),

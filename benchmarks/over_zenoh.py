@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.interleaved import Interleaved
-from benchmarks.quarter_car import ESTIMATORS, system
+from benchmarks.quarter_car import ESTIMATOR_NAMES, system
 from master_node.co_simulation import CoSimulation
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import slaves_on_bus
@@ -64,7 +64,7 @@ def _measure(
     requests = {s.requests / attempts for s in statistics.slaves.values()}
     attempt, empty = timing.medians()
     return (
-        f"{ESTIMATORS[estimator]}, k = {order}{', --pin' if pin else ''}"
+        f"{ESTIMATOR_NAMES[estimator]}, k = {order}{', --pin' if pin else ''}"
         f" ({'/'.join(f'{r:g}' for r in requests)} requests a slave)",
         f"{attempt:.0f} us",
         f"{empty:.0f} us",

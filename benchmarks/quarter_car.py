@@ -8,7 +8,7 @@ from master_node import System, load_system
 EXAMPLE = Path(__file__).parents[1] / "examples" / "quarter_car"
 
 
-ESTIMATORS = {"mod": "EST_mod", "rich": "EST_Rich"}
+ESTIMATOR_NAMES = {"mod": "EST_mod", "rich": "EST_Rich"}
 """The paper's names of the estimators."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import psutil
 
 from benchmarks.interleaved import Interleaved
-from benchmarks.quarter_car import ESTIMATORS, EXAMPLE, system
+from benchmarks.quarter_car import ESTIMATOR_NAMES, EXAMPLE, system
 from master_node.co_simulation import CoSimulation
 from master_node.configure_slaves import configure
 from master_node.slave_group import SlaveGroup
@@ -45,7 +45,7 @@ def _double_steps(estimator: str, *, in_process: bool) -> tuple[str, str, str, s
     fork, native = (median(medians) for medians in attempts.values())
     where = "in process" if in_process else "over Zenoh"
     return (
-        f"attempted double step {where}, {ESTIMATORS[estimator]}, k = 1",
+        f"attempted double step {where}, {ESTIMATOR_NAMES[estimator]}, k = 1",
         f"{fork:.0f} us",
         f"{native:.0f} us",
         f"{fork / native:.2f}",

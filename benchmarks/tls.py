@@ -7,7 +7,7 @@ from time import perf_counter
 
 import numpy as np
 
-from benchmarks.quarter_car import ESTIMATORS, system
+from benchmarks.quarter_car import ESTIMATOR_NAMES, system
 from master_node.co_simulation import CoSimulation
 from master_node.configuration import System
 from master_node.observers import Attempt, RunEnd, RunStart
@@ -77,7 +77,7 @@ def _measure(certificates: str, estimator: str) -> tuple[str, str, str, str]:
     for thread in runs:
         thread.join()
     return (
-        f"{ESTIMATORS[estimator]}, k = 1",
+        f"{ESTIMATOR_NAMES[estimator]}, k = 1",
         f"{secure.median:.0f} us",
         f"{plain.median:.0f} us",
         f"{secure.median / plain.median:.2f}",

@@ -10,12 +10,9 @@
 from __future__ import annotations
 
 import json
-import lzma
 import os
 import shutil
-import struct
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -26,6 +23,7 @@ from zlib import crc32
 
 from master_node.call_log import CallLog, LoggedStep, SavedState
 from master_node.results.files import cannot_read, cannot_write, malformed, replacing
+from protocol.archives import UNREADABLE
 from protocol.errors import DoublestepError, ResultsError
 
 CHECKPOINT_FOLDER = "checkpoint"
@@ -36,19 +34,8 @@ _RUN = "run.json"
 _VERSION = 1
 _LENGTH = Struct("<I")
 
-_MALFORMED = (  # all that damaged bytes become on the way through zipfile and json
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    struct.error,
-    EOFError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    RuntimeError,
-)
+_MALFORMED = (*UNREADABLE, LookupError, TypeError, AttributeError, OverflowError)
+"""All that damaged bytes become on the way through zipfile and json."""
 
 
 class SavedSlave(NamedTuple):

@@ -24,7 +24,7 @@ MAX_RATIO = 200
 MAX_XML_BYTES = 64 * 2**20
 _RATIO_FREE_BYTES = 16 * 2**20
 
-_UNREADABLE = (  # all that zipfile raises for what is no zip file or a damaged one
+UNREADABLE = (
     zipfile.BadZipFile,
     zlib.error,
     lzma.LZMAError,
@@ -34,6 +34,7 @@ _UNREADABLE = (  # all that zipfile raises for what is no zip file or a damaged 
     NotImplementedError,
     RuntimeError,
 )
+"""All that `zipfile` raises for what is no zip file or a damaged one."""
 
 
 @contextmanager
@@ -54,7 +55,7 @@ def checked_archive(path: Path, kind: str) -> Iterator[zipfile.ZipFile]:
         with zipfile.ZipFile(path) as archive:
             _check_entries(path, archive.infolist())
             yield archive
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise ModelError(
             f"{path}: not a readable {kind} archive: {error}", remedy=f"export the {kind} again"
         ) from error

@@ -19,7 +19,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import psutil
@@ -832,19 +832,24 @@ def test_a_wrong_command_line(
 # ---- Who reads what a command says --------------------------------------------------------------
 
 
+def help_into(output: IO[bytes], module: str) -> subprocess.CompletedProcess[bytes]:
+    """What a command says of itself, written there."""
+    return subprocess.run(
+        [sys.executable, "-m", module, "--help"],
+        stdout=output,
+        stderr=subprocess.PIPE,
+        timeout=BOUND,
+        check=False,
+    )
+
+
 @pytest.mark.parametrize("module", ["master_node", "slave_node"])
 def test_a_reader_that_has_left_changes_nothing(module: str) -> None:
     """As with ``| head``: no message and the same exit code, as 1 has a meaning."""
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as closed:
-        done = subprocess.run(
-            [sys.executable, "-m", module, "--help"],
-            stdout=closed,
-            stderr=subprocess.PIPE,
-            timeout=BOUND,
-            check=False,
-        )
+        done = help_into(closed, module)
     assert (done.returncode, done.stderr) == (0, b"")
 
 
@@ -853,13 +858,7 @@ def test_a_reader_that_has_left_changes_nothing(module: str) -> None:
 def test_an_output_that_cannot_be_written(module: str) -> None:
     """Exit code 7 and one line."""
     with Path("/dev/full").open("wb") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", module, "--help"],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            timeout=BOUND,
-            check=False,
-        )
+        done = help_into(full, module)
     assert done.returncode == 7
     assert b"cannot write to the standard output: No space left" in done.stderr
     assert len(done.stderr.splitlines()) == 1

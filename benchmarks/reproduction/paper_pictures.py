@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from benchmarks.quarter_car import ESTIMATOR_NAMES
 from benchmarks.reproduction.exact_quarter_car import FloatArray
 from benchmarks.reproduction.local_error_study import (
     FACTORS,
@@ -26,7 +27,6 @@ from benchmarks.reproduction.local_error_study import (
 from benchmarks.reproduction.table_1 import Measured
 
 DOTS_PER_INCH = 100
-_NAMES = {"rich": "EST_Rich", "mod": "EST_mod"}
 _GREY, _BLUE, _RED = "#3b4a5a", "#0969da", "#d1242f"
 _COLOURS = ("#3b4a5a", "#0969da", "#d1242f", "#1a7f37")
 _PALE = "#9ec5fe"
@@ -95,7 +95,7 @@ def _draw_steps(panels: Sequence[Axes], estimator: str, run: Measured) -> None:
     style: dict[str, Any] = {
         "color": _PALE if is_under else _GREY,
         "linewidth": 2.6 if is_under else 0.9,
-        "label": _NAMES[estimator],
+        "label": ESTIMATOR_NAMES[estimator],
     }
     panels[0].plot(
         [0.0, *rejected["time"], end],
@@ -154,7 +154,7 @@ def quotients(path: Path, results: Study) -> None:
             panel.set_xticks(LADDER, [f"{step_size * 1e3:g}" for step_size in LADDER])
             panel.minorticks_off()
             panel.set_ylim(0.0, 2.0)
-        row[0].set_ylabel(f"{_NAMES[estimator]} / true error")
+        row[0].set_ylabel(f"{ESTIMATOR_NAMES[estimator]} / true error")
     for panel, factor in zip(axes[0], FACTORS, strict=True):
         title = "H as before" if factor == 1.0 else f"H {factor:g} times the one before"
         panel.set_title(title, fontsize=10)

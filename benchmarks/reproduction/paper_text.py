@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.quarter_car import ESTIMATOR_NAMES
 from benchmarks.reproduction import force_coupling
 from benchmarks.reproduction.exact_quarter_car import FloatArray, outputs
 from benchmarks.reproduction.force_coupling import Case
@@ -35,8 +36,6 @@ from benchmarks.reproduction.table_1 import (
     Spread,
 )
 from master_node.numerics.extrapolation import POLYNOMIALS, InputPolynomial
-
-_NAMES = {"rich": "EST_Rich", "mod": "EST_mod"}
 
 
 @dataclass(frozen=True)
@@ -419,7 +418,7 @@ def _force_row(evidence: Evidence, case: Case) -> list[object]:
     return [
         f"{case.absolute:g} N",
         case.order,
-        _NAMES[case.estimator],
+        ESTIMATOR_NAMES[case.estimator],
         fmus.steps,
         python.steps if python else "",
         fmus.rejections,
@@ -515,7 +514,7 @@ def _constants(evidence: Evidence) -> Iterable[str]:
 
 def _limits_table(results: Study) -> str:
     columns = [(estimator, factor) for estimator in ESTIMATORS for factor in FACTORS]
-    head = ["k", "constants", *(f"{_NAMES[e]}, H x {factor:g}" for e, factor in columns)]
+    head = ["k", "constants", *(f"{ESTIMATOR_NAMES[e]}, H x {factor:g}" for e, factor in columns)]
     rows = []
     for polynomial in VALUES_ONLY:
         for constants in ("paper", "exact"):
@@ -535,7 +534,7 @@ def _deviations_table(results: Study, polynomials: Iterable[InputPolynomial]) ->
         (
             [
                 str(polynomial),
-                _NAMES[estimator],
+                ESTIMATOR_NAMES[estimator],
                 *(f"{x:.3f}" for x in worst_deviation(results, polynomial, estimator)),
             ]
             for polynomial in polynomials

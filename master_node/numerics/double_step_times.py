@@ -37,7 +37,9 @@ class DoubleStepTimes(NamedTuple):
 
 
 def step_end(begin: float, step_size: float) -> tuple[float, float]:
-    """Where a step of H from ``begin`` ends [s], and its size, which is not above H.
+    """Where a step of H from ``begin`` ends [s], and its size.
+
+    It is not above H, unless there is no number between ``begin`` and that end.
 
     Far from t = 0 rounding moves T + H by up to a percent of H, the same way in step after step of
     the same H. Slaves that took H would get ahead of the time or fall behind it, so there the size
