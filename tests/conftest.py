@@ -21,6 +21,8 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
+from tests.signal_dispositions import default_dispositions
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 # A slow moment of the machine is no counterexample.
@@ -41,6 +43,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "no_process_left" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.xdist_group("processes"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _signals_as_in_a_login_shell() -> Iterator[None]:
+    """Commands that tests start can be interrupted, also where the suite itself cannot."""
+    with default_dispositions():
+        yield
 
 
 def _example(folder: str, script: str) -> ModuleType:

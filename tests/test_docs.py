@@ -153,6 +153,17 @@ def test_a_command_line_in_a_document_can_be_given(document: str, words: list[st
         assert (ROOT / file).is_file(), f"{document} names {file}"
 
 
+@pytest.mark.parametrize(
+    ("target", "has_tools"), [("demo", False), ("test", True), ("check", True)]
+)
+def test_the_demo_installs_no_development_tools(target: str, has_tools: bool) -> None:
+    """In a fresh clone: who only tries the program installs what the program needs."""
+    words = ["make", "--dry-run", "--no-print-directory", target, "VENV=no_such_folder"]
+    recipe = subprocess.check_output(words, cwd=ROOT, text=True, timeout=BOUND)
+    assert "pip install" in recipe
+    assert (".[dev]" in recipe) == has_tools
+
+
 def check_python(arguments: list[str]) -> list[str]:
     """Check a call of Python; gives the files that it names."""
     match arguments:
