@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -52,6 +53,18 @@ def plot_result(
         KeyError: no such variable, or one that holds no numbers.
         ResultsError: the file cannot be written.
     """
+    with matplotlib.rc_context():
+        if _is_set_by_working_directory():
+            matplotlib.rcdefaults()
+        return _plot(result, path, show, variables)
+
+
+def _is_set_by_working_directory() -> bool:
+    """A ``matplotlibrc`` there goes before the user's own, and can have LaTeX run its text."""
+    return Path(matplotlib.matplotlib_fname()).resolve().parent == Path.cwd()
+
+
+def _plot(result: Result, path: Path | None, show: bool, variables: Sequence[str] | None) -> Figure:
     panels = _panels(result, _drawable(result) if variables is None else variables)
     shown = panels[:_OUTPUT_PANELS] if variables is None else panels
     steps = result.steps

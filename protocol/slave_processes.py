@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -26,6 +25,7 @@ from protocol.errors import (
     SlaveLostError,
 )
 from protocol.keys import SlaveKey
+from protocol.python_processes import python_command
 
 _END_TIME = 2.0
 _KILL_TIME = 5.0
@@ -66,7 +66,7 @@ class SlaveProcess:
         processor: int | None = None,
         goes_on: bool = False,
     ) -> None:
-        command = [sys.executable, "-m", "slave_node", "serve"]
+        command = python_command("-m", "slave_node", "serve")
         command += ["--base", str(base), "--name", key.name, "--instance", key.instance]
         command += [*connection, "--stay-with-parent"]
         if processor is not None:

@@ -32,6 +32,7 @@ from protocol.errors import (
     SlaveCrashedError,
 )
 from protocol.logs import LogFormat, configure_logs
+from protocol.python_processes import restore_path, safe_path
 from protocol.slave import CallExecutor, SlaveDescription, StartValue
 from slave_node.deaths import death
 from slave_node.pipe import Pipe
@@ -136,7 +137,8 @@ class WorkerProcess:
         self._process = context.Process(
             target=_main, args=(theirs, self._reference, self._scratch), daemon=True
         )
-        self._process.start()
+        with safe_path():
+            self._process.start()
         theirs.close()
         self._guard = _start_guard(self._process, self._pipe)
         try:
@@ -245,6 +247,7 @@ def _end_with(worker: int, pipe: Pipe) -> None:
 def _main(end: socket.socket, reference: ModelReference, scratch: str) -> None:
     """Load the model, then execute programs until the node says end or is gone."""
     _die_with_parent()
+    restore_path()
     if sys.platform == "linux":
         os.setsid()  # what the model starts is in this group, see `_start_guard`
     pipe = Pipe(end)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from master_node.study.case import Case, write_case
 from master_node.study.directory import put_in_place
 from master_node.study.records import CASE_FILE, LOG_FILE, RunRecord, write_record
 from protocol.errors import DeadlineError, ResultsError
+from protocol.python_processes import python_command
 
 END_TIME = 0.2
 """How long an interrupted run has to end by itself [s]; nothing that it wrote is kept."""
@@ -86,7 +86,7 @@ class RunProcess:
             raise ResultsError(f"cannot start run {task.number}: {error}") from error
 
     def _command(self) -> list[str]:
-        words = [sys.executable, "-m", "master_node", "run", self.task.system_file]
+        words = python_command("-m", "master_node", "run", self.task.system_file)
         words += ["--case", str(self._part / CASE_FILE), "--output", str(self._part)]
         words += ["--quiet", "--stay-with-parent"]
         words += ["--in-process"] if self.task.in_process else []

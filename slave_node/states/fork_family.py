@@ -13,6 +13,7 @@ from contextlib import suppress
 from time import monotonic
 
 from protocol.errors import SlaveCrashedError
+from protocol.python_processes import python_command
 from slave_node.states.channel import PROCESS, Channel
 from slave_node.states.fork_keeper import OBITUARY
 
@@ -45,7 +46,7 @@ class HolderFamily:
         descriptors = (theirs.fileno(), obituaries)
         try:
             self._keeper = subprocess.Popen(
-                [sys.executable, "-c", _START, json.dumps(sys.path), *map(str, descriptors)],
+                python_command("-c", _START, json.dumps(sys.path), *map(str, descriptors)),
                 stdin=subprocess.PIPE,
                 pass_fds=descriptors,
                 start_new_session=True,  # Ctrl-C is for who started us
