@@ -23,7 +23,7 @@ from zlib import crc32
 
 from master_node.call_log import CallLog, LoggedStep, SavedState
 from master_node.results.files import cannot_read, cannot_write, malformed, replacing
-from protocol.archives import UNREADABLE
+from protocol.archives import UNREADABLE, bounded_archive, read_entry
 from protocol.errors import DoublestepError, ResultsError
 
 CHECKPOINT_FOLDER = "checkpoint"
@@ -33,6 +33,7 @@ _RUN_FILE = "run.zip"
 _RUN = "run.json"
 _VERSION = 1
 _LENGTH = Struct("<I")
+_LARGEST = 2**30
 
 _MALFORMED = (*UNREADABLE, LookupError, TypeError, AttributeError, OverflowError)
 """All that damaged bytes become on the way through zipfile and json."""
@@ -168,8 +169,8 @@ class CheckpointStore:
         path = self._folder / _RUN_FILE
         try:
             system = json.loads((self._folder / _SYSTEM_FILE).read_bytes())
-            with zipfile.ZipFile(path) as archive:
-                header = json.loads(archive.read(_RUN))
+            with bounded_archive(path) as archive:
+                header = json.loads(read_entry(archive, _RUN, _LARGEST))
                 if header["version"] != _VERSION:
                     raise malformed(path, f"version {header['version']} instead of {_VERSION}")
                 slaves = {}
@@ -177,7 +178,7 @@ class CheckpointStore:
                     number = told.pop("state")
                     state = None
                     if number is not None:
-                        state = SavedState(archive.read(f"{name}.state"), number)
+                        state = SavedState(read_entry(archive, f"{name}.state", _LARGEST), number)
                     self._calls[name] = calls = _CallsFile(**told)
                     log = CallLog()
                     log.resume(state, calls.first, list(self._read(name, calls)))

@@ -6,6 +6,7 @@ import posixpath
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
+from zipfile import ZipFile, ZipInfo
 
 from master_node.ssp.definitions import Definitions, read_connector, read_definitions
 from master_node.ssp.parameters import (
@@ -30,7 +31,7 @@ from master_node.ssp.structure import (
 )
 from master_node.ssp.transformations import read_transformation
 from master_node.ssp.xml_nodes import Node, as_integer, boolean, number, parse
-from protocol.archives import MAX_XML_BYTES, checked_archive
+from protocol.archives import MAX_TOTAL_BYTES, MAX_XML_BYTES, checked_archive
 from protocol.errors import ModelError
 from protocol.names import nearest
 
@@ -122,6 +123,7 @@ class _Reader:
         self._notes = notes
         self._packages = 0
         self._elements = 0
+        self._room = MAX_TOTAL_BYTES
 
     def extract(self, package: Path, directory: Path) -> None:
         """Extract what a system can refer to: descriptions at the root, and resources."""
@@ -133,7 +135,7 @@ class _Reader:
                 parts = PurePosixPath(entry.filename).parts
                 is_description = len(parts) == 1 and entry.filename.lower().endswith(".ssd")
                 if is_description or parts[0] == "resources":
-                    archive.extract(entry, directory)
+                    self._unpack(package, archive, entry, directory)
                 elif not entry.is_dir() and parts[0] != "documentation":
                     self._notes.tell(f"{package}: entry {entry.filename!r:.200} is not carried")
             variants = [n for n in names if "/" not in n and n.lower().endswith(".ssd")]
@@ -188,8 +190,18 @@ class _Reader:
         with checked_archive(fmu.path, "FMU") as archive:
             if place.file not in archive.namelist():
                 raise node.error(f"{fmu} holds no {place.file!r:.200}")
-            archive.extract(place.file, directory)
+            self._unpack(fmu.path, archive, archive.getinfo(place.file), directory)
         return place
+
+    def _unpack(self, package: Path, archive: ZipFile, entry: ZipInfo, directory: Path) -> None:
+        """Extract an entry, as long as all nested packages together stay within the limit."""
+        self._room -= entry.file_size
+        if self._room < 0:
+            raise ModelError(
+                f"{package}: entry {entry.filename!r:.200}: all packages together unpack to more "
+                f"than {MAX_TOTAL_BYTES} bytes"
+            )
+        archive.extract(entry, directory)
 
     def _directory(self, node: Node) -> Path:
         """A new one for what is extracted."""

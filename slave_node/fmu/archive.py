@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from fmpy import platform, platform_tuple, sharedLibraryExtension
 
-from protocol.archives import MAX_XML_BYTES, check_xml, checked_archive
+from protocol.archives import MAX_XML_BYTES, bounded_archive, check_xml, checked_archive, read_entry
 from protocol.errors import ModelError
 
 PLATFORM_FOLDERS = (str(platform), str(platform_tuple))
@@ -48,7 +48,7 @@ def check_binary(fmu: Path, directory: Path, model_identifier: str, folder: str)
         raise ModelError(f"{fmu}: modelIdentifier {model_identifier!r:.60} is not a file name")
     binary: Path = directory / "binaries" / folder / (model_identifier + sharedLibraryExtension)
     if not binary.is_file():
-        with zipfile.ZipFile(fmu) as archive:
+        with bounded_archive(fmu) as archive:
             parts = [PurePosixPath(name).parts for name in archive.namelist()]
         found = sorted({p[1] for p in parts if p[0] == "binaries" and len(p) > 2})
         raise ModelError(
@@ -68,10 +68,7 @@ def _is_needed(name: str) -> bool:
 
 def _check_description(fmu: Path, archive: zipfile.ZipFile) -> None:
     try:
-        size = archive.getinfo("modelDescription.xml").file_size
+        xml = read_entry(archive, "modelDescription.xml", MAX_XML_BYTES)
     except KeyError:
         raise ModelError(f"{fmu}: not an FMU: it holds no modelDescription.xml") from None
-    where = f"{fmu}: modelDescription.xml"
-    if size > MAX_XML_BYTES:
-        raise ModelError(f"{where} of {size} bytes; limit {MAX_XML_BYTES}")
-    check_xml(where, archive.read("modelDescription.xml"))
+    check_xml(f"{fmu}: modelDescription.xml", xml)
