@@ -187,7 +187,7 @@ def _read_numpy(path: Path) -> Columns:
     try:
         loaded = np.load(path, allow_pickle=False)
         arrays = {name: loaded[name] for name in loaded.files} if path.suffix == ".npz" else loaded
-    except (ValueError, EOFError, AttributeError, BadZipFile) as error:
+    except (ValueError, EOFError, AttributeError, BadZipFile, MemoryError) as error:
         raise ConfigurationError(
             f"{path.name}: not a NumPy file of numbers, truth values or texts"
         ) from error

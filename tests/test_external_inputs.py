@@ -635,6 +635,9 @@ def folder(tmp_path: Path) -> Path:
     np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
     np.save(tmp_path / "three.npy", np.zeros((3, 3)))
     np.savez(tmp_path / "uneven.npz", t=np.zeros(2), z=np.zeros(3))
+    with (tmp_path / "endless.npy").open("wb") as file:
+        head = {"descr": "<f8", "fortran_order": False, "shape": (10**14, 2)}
+        np.lib.format.write_array_header_1_0(file, head)
     return tmp_path
 
 
@@ -658,6 +661,7 @@ def folder(tmp_path: Path) -> Path:
         ({"table": "empty.csv"}, "empty.csv: is empty"),
         ({"table": "text.npy"}, "text.npy: not a NumPy file of numbers"),
         ({"table": "objects.npy"}, "objects.npy: not a NumPy file of numbers"),
+        ({"table": "endless.npy"}, "endless.npy: not a NumPy file of numbers"),
         ({"table": "three.npy"}, r"an array of shape \(3, 3\) is neither structured"),
         ({"table": "uneven.npz"}, "2 times in 't' and 3 values in 'z'"),
         ({"table": ([0.0, 1.0], [1.0])}, r"times of shape \(2,\) and values of shape \(1,\)"),

@@ -731,6 +731,21 @@ def test_broken_bytes_load_or_are_refused(
         Result.load(path)
 
 
+def test_a_file_that_would_fill_the_memory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few kilobytes of a stranger's can be hundreds of millions of equal values."""
+    table = pa.table({"time": np.zeros(10**6), "a.x": np.zeros(10**6)})
+    pq.write_table(table, tmp_path / "a.parquet", compression="zstd")
+    savemat(tmp_path / "a.mat", {"data_2": np.zeros((2, 10**6))}, do_compression=True)
+    assert len(Result.load(tmp_path / "a.parquet").time) == 10**6
+    monkeypatch.setattr("master_node.results.files._GROWTH_FREE_BYTES", 0)
+    for name in ("a.parquet", "a.mat"):
+        assert (tmp_path / name).stat().st_size < 16_000
+        with pytest.raises(ResultsError, match="it says that it holds 2000000 values"):
+            Result.load(tmp_path / name)
+
+
 @pytest.mark.parametrize("suffix", [".arrow", ".parquet", ".mat", ".csv"])
 def test_a_missing_file_is_an_error_with_a_remedy(tmp_path: Path, suffix: str) -> None:
     """The system's own words, whoever reads."""

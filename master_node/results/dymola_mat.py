@@ -9,6 +9,7 @@ OpenModelica User's Guide, "The MATv4 Result File Format".
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import sys
@@ -20,11 +21,17 @@ from typing import Any, BinaryIO
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from scipy.io import loadmat, savemat
+from scipy.io import loadmat, savemat, whosmat
 
 from master_node.results.arrow_file import Stream
 from master_node.results.columns import DTYPES, NOTHING_KNOWN, Columns, Known, Table
-from master_node.results.files import cannot_read, cannot_write, malformed, replacing
+from master_node.results.files import (
+    cannot_read,
+    cannot_write,
+    check_growth,
+    malformed,
+    replacing,
+)
 from protocol.errors import ResultsError
 from protocol.signals import FloatArray
 
@@ -83,11 +90,15 @@ def read_mat(path: Path, known: Known = NOTHING_KNOWN) -> Table:
     try:
         with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("error")
+            check_growth(path, sum(math.prod(shape) for _, shape, _ in whosmat(file)))
+            file.seek(0)
             matrices = loadmat(file, chars_as_strings=False, variable_names=wanted)
         names, descriptions, information, data = _normal(matrices)
         return _table(names, descriptions, information, data, known)
     except OSError as error:
         raise cannot_read(path, error) from error
+    except ResultsError:
+        raise
     except Exception as error:  # SciPy raises all kinds for bytes that it cannot read
         raise malformed(path, f"not a result in the layout of Dymola: {error}") from error
 

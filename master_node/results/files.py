@@ -28,6 +28,8 @@ STREAM_FILE = ".results.arrow"
 """Stands in for results.arrow while a run without it goes on that ends with Parquet or MAT."""
 
 _UNFINISHED = "{}.part"
+_MAX_GROWTH = 1000
+_GROWTH_FREE_BYTES = 2**30
 
 FILES = (
     SUMMARY_FILE,
@@ -209,6 +211,20 @@ def cannot_read(path: Path, error: OSError) -> ResultsError:
         f"cannot read {path}: {error.strerror or error}",
         remedy="name a results directory, or a file .csv, .arrow, .parquet or .mat",
     )
+
+
+def check_growth(path: Path, cells: int) -> None:
+    """Refuse a file that becomes far more in memory than it is: results do not.
+
+    Args:
+        path: of a compressed file.
+        cells: how many values it says that it holds.
+
+    Raises:
+        ResultsError: they would take more than 1 GiB and a thousand times the length of the file.
+    """
+    if 8 * cells > _GROWTH_FREE_BYTES + _MAX_GROWTH * path.stat().st_size:
+        raise malformed(path, f"it says that it holds {cells} values, which it is too short for")
 
 
 def malformed(path: Path, what: str, line: int | None = None) -> ResultsError:

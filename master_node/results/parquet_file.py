@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 
 from master_node.results.arrow_file import BROKEN, Stream, columns_of, table_of
 from master_node.results.columns import Table
-from master_node.results.files import cannot_read, cannot_write, malformed, replacing
+from master_node.results.files import cannot_read, cannot_write, check_growth, malformed, replacing
 from protocol.errors import ResultsError
 
 _CELLS = 1_000_000
@@ -50,6 +50,7 @@ def read_parquet(path: Path) -> Table:
     try:
         with path.open("rb") as raw, pq.ParquetFile(raw) as file:
             columns = columns_of(file.schema_arrow, path)
+            check_growth(path, file.metadata.num_rows * file.metadata.num_columns)
             table = file.read()
             table.validate(full=True)
             return table_of(path, table, columns)
