@@ -49,15 +49,8 @@ class Restarts:
         """A slave as it was loaded first.
 
         Raises:
-            DoublestepError: it is not to be had; waits for other slaves end then, too.
+            DoublestepError: it cannot be had now; a second attempt may succeed.
         """
-        try:
-            return self._restart(name)
-        except DoublestepError as error:
-            self._presence.abandon(name, error.cause)
-            raise
-
-    def _restart(self, name: str) -> RemoteSlave:
         remote = self._remotes[name]
         if remote.is_present:
             try:
@@ -75,3 +68,7 @@ class Restarts:
         self._remotes[name] = remote = self._claim(key)
         self._presence.follow(remote)
         return remote
+
+    def give_up(self, name: str, cause: str) -> None:
+        """The slave is lost for good: waits for other slaves end, too."""
+        self._presence.abandon(name, cause)

@@ -1,9 +1,10 @@
 """A slave that can be brought back to where it stood, in a fresh process.
 
-It stands in front of a link and notes what goes through it. When the process behind it is killed,
+It stands in front of a link and notes what goes through it. When the process behind it is gone,
 a new one is started, restored, and does again what was under way: who sends requests sees nothing
-but a pause. When the model itself ended the process, or never ended a step, the step is answered
-as a failed one, and the slave is restored before the next request.
+but a pause. When the model itself ended the process, the step is answered as a failed one, and the
+slave is restored before the next request; so too when a step did not end in time, and, done again
+as it was in a fresh process, did not once more. A host that stood still is not the model's doing.
 """
 
 from __future__ import annotations
@@ -51,7 +52,10 @@ _OTHER_OUTPUTS = "the same steps lead to other outputs"
 
 Restart = Callable[[], SlaveLink]
 """Gives a link to a fresh process with the slave as it was loaded first; raises
-`DoublestepError`."""
+`DoublestepError`, after which it may be called again."""
+
+GiveUp = Callable[[str], None]
+"""Is told why the slave is lost for good: the run ends, and no other slave is waited for."""
 
 
 class BrokenStepError(StepRejectedError):
@@ -98,6 +102,7 @@ class RestorableSlave:
         link: to it, instantiated.
         description: what it said of itself.
         restart: None: it cannot be started again; what it did is noted all the same.
+        give_up: told once, when the slave is lost for good.
 
     Attributes:
         restarts: how often it was started again.
@@ -109,12 +114,14 @@ class RestorableSlave:
         link: SlaveLink,
         description: SlaveDescription,
         restart: Restart | None,
+        give_up: GiveUp = lambda _: None,
     ) -> None:
         self.name = name
         self.restarts = 0
         self._link = link
         self._sha256 = description.sha256
         self._restart = restart
+        self._give_up = give_up
         self._calls: Sequence[Call] = ()
         self._broken: DoublestepError | None = None
         self._describe(description)
@@ -149,6 +156,7 @@ class RestorableSlave:
 
     def finish(self) -> Reply:
         """See `SlaveLink`."""
+        was_late = False
         for number in range(_TIMES + 1):
             reply: Reply | None = None
             failure: DoublestepError | None = None
@@ -164,13 +172,21 @@ class RestorableSlave:
                 assert reply is not None
                 self._note(reply)
                 return reply
-            if self._can_be_broken(failure):
+            can_be_broken, is_late = (
+                self._can_be_broken(failure),
+                isinstance(failure, DeadlineError),
+            )
+            if can_be_broken and (was_late or not is_late):
                 self._broken = failure
                 return Reply([], BrokenStepError(failure), 0.0)
-            if self._restart is None or not _is_lost(failure) or number == _TIMES:
+            is_repeated = can_be_broken or (self._restart is not None and _is_lost(failure))
+            if not is_repeated or number == _TIMES:
+                if _is_lost(failure):
+                    self._give_up(failure.cause)
                 if reply is None:
                     raise failure
                 return reply
+            was_late |= is_late
             self._locate(failure)
             self._recover(failure)
             self._link.start(self._calls)
@@ -218,10 +234,12 @@ class RestorableSlave:
             data = reply.results[1]
             assert isinstance(data, bytes)
             self.log.save(data)
-        elif _is_lost(reply.error) and self._restart is not None:
-            self._broken = reply.error.located(slave=self.name, phase="serialize_state")
-        elif _is_lost(reply.error):
-            raise reply.error.located(slave=self.name, phase="serialize_state")
+        elif isinstance(reply.error, SlaveLostError | SlaveCrashedError):
+            lost = reply.error.located(slave=self.name, phase="serialize_state")
+            if self._restart is None:
+                raise lost
+            self._broken = lost
+            self._can_serialize &= _is_lost(lost)
         else:
             log.warning("%s: its state cannot be serialised: %s", self.name, reply.error)
             self._can_serialize = False
@@ -268,8 +286,11 @@ class RestorableSlave:
                 self._link = self._restored()
                 break
             except (DoublestepError, _NotRestoredError) as error:
-                if not _is_lost(error) or number == _TIMES - 1:
-                    raise self._unrestored(cause, error) from error
+                may_pass = _is_lost(error) or isinstance(error, DeadlineError)
+                if not may_pass or number == _TIMES - 1:
+                    lost = self._unrestored(cause, error)
+                    self._give_up(lost.cause)
+                    raise lost from error
         log.warning(
             "%s; started again and restored in %.1f s: the run goes on", cause, monotonic() - begin
         )

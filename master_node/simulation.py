@@ -245,15 +245,22 @@ class _ResultFiles:
 
 def _restorable(slaves: Slaves, system: System, directory: Path | None) -> list[RestorableSlave]:
     """The slaves in front of which calls are noted: all or none."""
-    if slaves.restarts is None and (directory is None or not _writes_checkpoints(system)):
+    restarts = slaves.restarts
+    if restarts is not None:
+        return [
+            RestorableSlave(
+                name,
+                link,
+                slaves.descriptions[name],
+                partial(restarts.restart, name),
+                partial(restarts.give_up, name),
+            )
+            for name, link in slaves.links.items()
+        ]
+    if directory is None or not _writes_checkpoints(system):
         return []
     return [
-        RestorableSlave(
-            name,
-            link,
-            slaves.descriptions[name],
-            None if slaves.restarts is None else partial(slaves.restarts.restart, name),
-        )
+        RestorableSlave(name, link, slaves.descriptions[name], None)
         for name, link in slaves.links.items()
     ]
 

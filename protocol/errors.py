@@ -11,7 +11,7 @@
     │   ├── FatalSlaveError      fmi2Fatal: the model must not be called any more          exit 4
     │   ├── StepSizeError        the smallest communication step size was reached         exit 4
     │   └── SlaveCrashedError    the process that holds the model died of the model       exit 4
-    │       └── SlaveKilledError it was ended from outside                                exit 3
+    │       └── SlaveKilledError it is gone, and not known to be by the model's doing     exit 3
     ├── DeadlineError            a wait reached its bound                                 exit 5
     ├── ProtocolError            the two sides do not speak the same language             exit 6
     │   ├── MalformedMessageError  bytes that are not a message, or beyond a limit        exit 6
@@ -157,7 +157,10 @@ class SlaveCrashedError(SlaveError):
 
 
 class SlaveKilledError(SlaveCrashedError):
-    """The same by a signal from outside, such as SIGKILL: the model has nothing to do with it."""
+    """Its death is not known to be the model's doing: a signal from outside, or nothing is known.
+
+    It never rejects a step: the slave is restored, and does the same again.
+    """
 
     exit_code = 3
 

@@ -16,6 +16,7 @@ import socket
 import sys
 import tempfile
 import threading
+import traceback
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -30,15 +31,17 @@ from protocol.errors import (
     DoublestepError,
     MalformedMessageError,
     SlaveCrashedError,
+    SlaveKilledError,
 )
 from protocol.logs import LogFormat, configure_logs
 from protocol.python_processes import restore_path, safe_path
 from protocol.slave import CallExecutor, SlaveDescription, StartValue
-from slave_node.deaths import death
+from slave_node.deaths import OWN_FAILURE, death, how_ended
 from slave_node.pipe import Pipe
 
 _END = b""
 _CLOSE_TIME = 0.5
+_DEATH_TIME = 5.0  # whose pipe is closed is soon dead, unless the host is busy
 _PR_SET_PDEATHSIG = 1
 
 
@@ -69,7 +72,8 @@ class Worker(Protocol):
         """The reply to a program.
 
         Raises:
-            SlaveCrashedError: the worker is dead; ``start`` makes a new one.
+            SlaveCrashedError: the worker is dead; ``start`` makes a new one. A
+                `SlaveKilledError` where the program is not known to be why.
         """
         ...
 
@@ -166,11 +170,14 @@ class WorkerProcess:
             return encode_error(MalformedMessageError("a program is empty"))
         with self._using:
             if self._pipe is None:
-                raise SlaveCrashedError(
+                raise SlaveKilledError(
                     "the process that held the model is gone", remedy="claim the slave again"
                 )
             try:
                 self._pipe.send(program)
+            except OSError:
+                raise self._lost() from None
+            try:
                 return self._pipe.receive()
             except (EOFError, OSError):
                 raise self._crashed() from None
@@ -190,23 +197,32 @@ class WorkerProcess:
             if self._pipe is not None and self._process is not None:
                 with suppress(OSError):
                     self._pipe.send(_END)
-                    self._wait_ended(self._process)
+                    self._wait_ended(self._process, _CLOSE_TIME)
             self._discard()
         finally:
             self._using.release()
 
     def _crashed(self) -> SlaveCrashedError:
+        """The error that it died of what it was asked."""
+        return death(self._exit_code())
+
+    def _lost(self) -> SlaveKilledError:
+        """The error that it died while it was asked for nothing."""
+        return SlaveKilledError(f"the process that held the model {how_ended(self._exit_code())}")
+
+    def _exit_code(self) -> int | None:
+        """Of a process that is dying; None: not known."""
         assert self._process is not None
-        self._wait_ended(self._process)
+        self._wait_ended(self._process, _DEATH_TIME)
         self._process.join(_CLOSE_TIME)
         code = self._process.exitcode
         self._discard()
-        return death(code)
+        return code
 
     def _discard(self) -> None:
         if self._process is not None:
             self._process.kill()
-            self._wait_ended(self._process)
+            self._wait_ended(self._process, _CLOSE_TIME)
             self._process.join(_CLOSE_TIME)
             self._process = self._guard = None
         if self._pipe is not None:
@@ -216,12 +232,9 @@ class WorkerProcess:
             shutil.rmtree(self._scratch, ignore_errors=True)
             self._scratch = None
 
-    def _wait_ended(self, process: BaseProcess) -> None:
-        """For a short time; the guard is done before the process is reaped and its id free."""
-        if self._guard is None:
-            process.join(_CLOSE_TIME)
-        else:
-            self._guard.join(_CLOSE_TIME)
+    def _wait_ended(self, process: BaseProcess, timeout: float) -> None:
+        """At most so long; the guard is done before the process is reaped and its id free."""
+        (process if self._guard is None else self._guard).join(timeout)
 
 
 def _start_guard(process: BaseProcess, pipe: Pipe) -> threading.Thread | None:
@@ -246,6 +259,15 @@ def _end_with(worker: int, pipe: Pipe) -> None:
 
 def _main(end: socket.socket, reference: ModelReference, scratch: str) -> None:
     """Load the model, then execute programs until the node says end or is gone."""
+    try:
+        _hold(end, reference, scratch)
+    except Exception:
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(OWN_FAILURE)
+
+
+def _hold(end: socket.socket, reference: ModelReference, scratch: str) -> None:
     _die_with_parent()
     restore_path()
     if sys.platform == "linux":

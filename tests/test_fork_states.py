@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -24,6 +25,7 @@ from protocol.calls import (
     ExitInitializationMode,
     GetState,
     Initialize,
+    Reset,
     SetInputs,
     SetState,
 )
@@ -37,7 +39,9 @@ from protocol.errors import (
     StepRejectedError,
 )
 from protocol.slave import Causality, Slave, SlaveDescription, StateKind, StepStatus, VariableType
+from slave_node.deaths import OWN_FAILURE, death
 from slave_node.examination import examine
+from slave_node.states.channel import Channel, Message
 from slave_node.states.fork_habits import Event, Habits
 from slave_node.states.held_process import HeldProcess
 from slave_node.worker import ModelReference, WorkerProcess
@@ -442,6 +446,102 @@ def test_a_killed_saved_state_is_named(fmu_dir: Path) -> None:
         with pytest.raises(SlaveKilledError, match="died by SIGKILL"):
             slave.set_state(state)
         assert slave.do_step(0.0, 1e-3, True).status is StepStatus.OK
+
+
+@pytest.mark.usefixtures("no_step_is_dear")
+def test_a_saved_state_that_is_killed_before_it_was_asked_anything(fmu_dir: Path) -> None:
+    """Its number stands unread in its socket. The step after it is not the one to blame."""
+    with wheel(fmu_dir, "fork") as slave:
+        slave.get_state()  # the only one that is waited for
+        slave.do_step(0.0, 1e-3, True)
+        before = family()
+        state = slave.get_state()
+        wait_until(lambda: len(family()) > len(before))
+        victims = family() - before
+        for victim in victims:
+            victim.kill()
+        wait_until(lambda: not living(victims))
+        slave.set_state(state)
+        with pytest.raises(SlaveKilledError, match="died by SIGKILL"):
+            slave.do_step(1e-3, 1e-3, True)
+
+
+def test_a_holder_that_dies_unasked_is_not_the_doing_of_the_next_step(fmu_dir: Path) -> None:
+    """Not even by a signal that models die of."""
+    with wheel(fmu_dir, "fork") as slave:
+        slave.get_state()
+        (holder,) = {p for p in family() if p.pid == slave._active._process}
+        holder.send_signal(signal.SIGSEGV)
+        wait_until(lambda: not living({holder}))
+        with pytest.raises(SlaveKilledError, match="died by SIGSEGV"):
+            slave.do_step(0.0, 1e-3, True)
+
+
+def test_an_interrupt_is_not_for_holders(fmu_dir: Path) -> None:
+    """SIGINT, to keeper and holders: all go on."""
+    with wheel(fmu_dir, "fork") as slave:
+        state = slave.get_state()
+        for process in family():
+            process.send_signal(signal.SIGINT)
+        for time in (0.0, 1e-3):
+            assert slave.do_step(time, 1e-3, True).status is StepStatus.OK
+        slave.set_state(state)
+        assert slave.do_step(0.0, 1e-3, True).status is StepStatus.OK
+        assert len(living(family())) == 3
+
+
+def test_a_worker_that_dies_unasked_is_not_the_doing_of_the_next_step(tmp_path: Path) -> None:
+    """The same for models in the worker itself; and of a worker that is gone nothing is known."""
+    worker = WorkerProcess(ModelReference(f"{MODELS}:Fragile", tmp_path, "x", state_kind="none"))
+    worker.start()
+    assert worker.pid is not None
+    psutil.Process(worker.pid).send_signal(signal.SIGSEGV)
+    assert worker._pipe is not None
+    assert worker._pipe.has_message(BOUND)
+    for words in ("died by SIGSEGV", "is gone"):
+        with pytest.raises(SlaveKilledError, match=words):
+            worker.execute(encode_program([Reset()]))
+    worker.stop()
+
+
+@pytest.mark.parametrize(
+    ("code", "kind"),
+    [
+        (None, SlaveKilledError),
+        (OWN_FAILURE, SlaveKilledError),
+        *((-number, SlaveKilledError) for number in (1, 2, 3, 9, 10, 12, 14, 15, 24, 25, 34)),
+        *((-number, SlaveCrashedError) for number in (4, 5, 6, 7, 8, 11, 31)),
+        (0, SlaveCrashedError),
+        (1, SlaveCrashedError),
+    ],
+)
+def test_only_what_is_known_to_be_the_model_s_doing_is_a_crash(
+    code: int | None, kind: type[SlaveCrashedError]
+) -> None:
+    """All other deaths, and unknown ones, restore the slave and reject nothing."""
+    assert type(death(code)) is kind
+
+
+def test_a_holder_that_does_not_read_is_not_dead() -> None:
+    """A long message to one that computes, or was stopped, waits; it is no sign of a death."""
+    ours, theirs = socket.socketpair()
+    payload = bytes(2**22)
+    received: list[object] = []
+    reader = threading.Thread(target=lambda: received.append(Channel(theirs).receive()))
+    idle = 0
+
+    def wait() -> None:
+        nonlocal idle
+        idle += 1
+        if idle == 3:
+            reader.start()
+
+    channel = Channel(ours, wait, 0.01)
+    channel.send(Message.PROGRAM, payload)
+    reader.join(BOUND)
+    assert received == [(Message.PROGRAM, payload)]
+    channel.close()
+    theirs.close()
 
 
 def test_a_killed_keeper_takes_nobody_along_and_leaves_nobody(fmu_dir: Path) -> None:

@@ -171,6 +171,48 @@ def test_killed_fmus_come_back_from_their_saved_states(
     assert len(warnings(caplog)) == 2
 
 
+class HolderKiller:
+    """Kills the processes that hold the states of the wheel, all but the keeper, now and then."""
+
+    def __init__(self, seed: int) -> None:
+        self.draw, self.number, self.kills = random.Random(seed), 0, 0
+
+    def started(self, _: object) -> None:
+        pass
+
+    def attempted(self, _: object) -> None:
+        self.number += 1
+        if self.number % 40 == 0:
+            worker = worker_of(node_of("wheel"))
+            keepers = [p for p in worker.children() if p.children()]
+            holders = [p for keeper in keepers for p in keeper.children(recursive=True)]
+            self.kills += len(holders) > 1
+            self.draw.choice(holders).kill()
+
+    def ended(self, _: object) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("seed", "estimator"), [(1, "mod"), (2, "rich"), (3, "mod")])
+def test_killed_saved_states_change_nothing(
+    seed: int, estimator: str, tmp_path: Path, fmu_dir: Path
+) -> None:
+    """As the kernel kills that runs out of memory: whichever process that it meets, the same files.
+
+    Most of them have not been asked for anything yet when they are killed.
+    """
+    simulation = f'{SMALL_STEPS}estimator = "{estimator}"\n'
+    (tmp_path / "a").mkdir()
+    file = system_file(
+        tmp_path / "a", fmu_dir / "chassis.fmu", fmu_dir / "wheel.fmu", simulation=simulation
+    )
+    undisturbed = files(load_system(file), tmp_path / "a", in_process=True)
+    file.write_text(file.read_text().replace("[slaves.wheel]", '[slaves.wheel]\nstate = "fork"'))
+    killer = HolderKiller(seed)
+    assert files(load_system(file), tmp_path / "b", observers=(killer,)) == undisturbed
+    assert killer.kills >= 2
+
+
 def node_of(name: str) -> psutil.Process:
     """The node that this process launched for a slave."""
     for child in psutil.Process().children():
@@ -217,6 +259,55 @@ def test_a_slave_that_is_killed_again_and_again(tmp_path: Path) -> None:
     assert 0.097 < last <= info.value.time
 
 
+MORTAL = """
+import os, signal, time
+from pathlib import Path
+from slave_node.model_loading import load_model_class
+folder = Path(__file__).parent
+(folder / f"node {{os.getppid()}}").touch()
+if len(list(folder.glob("node *"))) in {deadly}:
+    os.kill(os.getppid(), signal.SIGKILL)
+    time.sleep(60.0)
+Trapped = load_model_class({model!r}, folder)
+"""
+"""A model that kills its node where that is one of certain numbers to load it."""
+
+
+def mortal(folder: Path, deadly: set[int]) -> System:
+    """The quarter car with a chassis that is lost once, and again while it is started again."""
+    folder.mkdir()
+    (folder / "mortal.py").write_text(MORTAL.format(deadly=deadly, model=TRAPPED))
+    file = system_file(
+        folder,
+        f"{folder / 'mortal.py'}:Trapped",
+        simulation=FEW_STEPS,
+        chassis_parameters={"folder": folder, "traps": "0.03 kill node"},
+    )
+    return load_system(file)
+
+
+def test_a_slave_that_is_killed_while_it_is_started_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Twice in one recovery: neither this slave nor a healthy one is given up for that."""
+    undisturbed = files(car(tmp_path / "a", FEW_STEPS), tmp_path / "a", in_process=True)
+    caplog.clear()
+    assert files(mortal(tmp_path / "b", {2, 3}), tmp_path / "b") == undisturbed
+    (told,) = warnings(caplog)
+    assert re.match(r"chassis: do_step at .* signal 9.*; started again and restored", told)
+    assert len(list((tmp_path / "b").glob("node *"))) == 4
+
+
+def test_a_slave_that_is_killed_whenever_it_is_started_again(tmp_path: Path) -> None:
+    """Three times, then exit code 3 with slave, t, H and cause."""
+    with pytest.raises(SlaveLostError, match=r"^chassis: do_step at t=0\.0\S+ s, H=") as info:
+        simulate(mortal(tmp_path / "b", {2, 3, 4, 5, 6}), output=tmp_path / "out")
+    assert "it could not be started again and restored: its process died by signal 9" in str(
+        info.value
+    )
+    assert len(list((tmp_path / "b").glob("node *"))) == 4
+
+
 @pytest.mark.parametrize("what", ["kill worker", "kill node"])
 def test_a_slave_that_is_lost_in_its_initialization(
     what: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
@@ -248,11 +339,18 @@ def test_without_recovery_it_ends_the_run(tmp_path: Path) -> None:
 # ---- Models that end their process --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("what", ["crash", "abort", "hang"])
+@pytest.mark.parametrize(
+    ("traps", "words"),
+    [
+        ("0.03 crash", "died by SIGSEGV"),
+        ("0.03 abort", "died by SIGABRT"),
+        ("0.03 hang, 0.03 hang", "no reply within 2 s"),
+    ],
+)
 def test_a_crash_is_a_rejected_step(
-    what: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    traps: str, words: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """SIGSEGV, SIGABRT or an endless loop: from the snapshot it is tried smaller.
+    """SIGSEGV, SIGABRT, or twice without an end: from the snapshot it is tried smaller.
 
     The results are those of the same model that returns an error in the same step, bit for bit.
     """
@@ -260,19 +358,29 @@ def test_a_crash_is_a_rejected_step(
         car(tmp_path / "a", FEW_STEPS, traps="0.03 refuse"), tmp_path / "a", in_process=True
     )
     caplog.clear()
-    bus = "step_timeout = 2.0\n" if what == "hang" else ""
-    system = car(tmp_path / "b", FEW_STEPS, bus, traps=f"0.03 {what}")
+    bus = "step_timeout = 2.0\n" if "hang" in traps else ""
+    system = car(tmp_path / "b", FEW_STEPS, bus, traps=traps)
     results, steps = files(system, tmp_path / "b")
     assert results == refused
-    words = {
-        "crash": "died by SIGSEGV",
-        "abort": "died by SIGABRT",
-        "hang": "no reply within 2 s",
-    }
-    (told,) = warnings(caplog)
-    assert words[what] in told
+    told = warnings(caplog)
+    assert len(told) == traps.count("0.03")
+    assert all(words in text for text in told)
     (rejected,) = [row for row in steps.decode().splitlines() if "false" in row]
-    assert words[what] in rejected
+    assert words in rejected
+
+
+@pytest.mark.parametrize("estimator", ["mod", "none"])
+def test_a_step_that_once_did_not_end_is_repeated_as_it_was(
+    estimator: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A host that stood still is not the model's doing: the files of an undisturbed run."""
+    simulation = FEW_STEPS + f'estimator = "{estimator}"\n'
+    undisturbed = files(car(tmp_path / "a", simulation), tmp_path / "a", in_process=True)
+    caplog.clear()
+    system = car(tmp_path / "b", simulation, "step_timeout = 2.0\n", traps="0.03 hang")
+    assert files(system, tmp_path / "b") == undisturbed
+    (told,) = warnings(caplog)
+    assert "no reply within 2 s; started again and restored" in told
 
 
 def test_a_model_that_crashes_always(tmp_path: Path) -> None:
@@ -284,7 +392,7 @@ def test_a_model_that_crashes_always(tmp_path: Path) -> None:
 
 
 def test_a_model_that_hangs_always(tmp_path: Path) -> None:
-    """Tried once smaller, then exit code 5; no process is left."""
+    """Repeated once as it was and once smaller, then exit code 5; no process is left."""
     simulation = SMALL_STEPS + "smallest_step_size = 5e-4\n"
     system = car(tmp_path, simulation, "step_timeout = 1.0\n", always=0.0981, what="hang")
     with pytest.raises(DeadlineError) as info:
@@ -298,7 +406,7 @@ def test_a_model_that_hangs_always(tmp_path: Path) -> None:
 def test_without_an_estimator_nothing_is_repeated(what: str, code: int, tmp_path: Path) -> None:
     """A fixed step cannot be made smaller: the run ends with what happened."""
     simulation = "stop_time = 0.4\nestimator = 'none'\n"
-    system = car(tmp_path, simulation, "step_timeout = 2.0\n", traps=f"0.1 {what}")
+    system = car(tmp_path, simulation, "step_timeout = 2.0\n", always=0.1, what=what)
     with pytest.raises(DoublestepError, match=r"^chassis: do_step at t=0\.\S+ s, H=") as info:
         simulate(system)
     assert info.value.exit_code == code
@@ -517,6 +625,83 @@ def test_the_loss_of_another_slave_is_not_its_own(fresh: Iterator[SlaveLink]) ->
     with pytest.raises(SlaveLostError, match=r"^chassis: it died"):
         slave.finish()
     assert slave.restarts == 0
+
+
+@pytest.mark.parametrize("failures", [0, 2, 3])
+@pytest.mark.parametrize("kind", [SlaveLostError, DeadlineError])
+def test_a_slave_is_given_up_when_it_is_given_up(
+    failures: int, kind: type[DoublestepError], fresh: Iterator[SlaveLink]
+) -> None:
+    """Other slaves hear of it after the third failure, once, and never before."""
+    attempts, given_up = [], []
+
+    def restart() -> SlaveLink:
+        attempts.append(len(attempts))
+        if len(attempts) <= failures:
+            raise kind("not now")
+        return next(fresh)
+
+    first = Mortal(next(fresh))
+    description = first.link._executor.description
+    slave = RestorableSlave("wheel", first, description, restart, given_up.append)
+    executed(slave, *BEGINNING)
+    first.is_dead = True
+    slave.start(drawn_step(random.Random(0), 0.0, 1e-2))
+    if failures < 3:
+        assert slave.finish().error is None
+        assert not given_up
+    else:
+        with pytest.raises(SlaveLostError, match="it died; it could not be started again"):
+            slave.finish()
+        assert given_up == ["it died; it could not be started again and restored: not now"]
+    assert len(attempts) == min(failures + 1, 3)
+
+
+class Dying(Mortal):
+    """A link to a slave that answers with an error when its state is serialised."""
+
+    def __init__(self, link: SlaveLink, error: DoublestepError) -> None:
+        super().__init__(link)
+        self.error = error
+        self.is_saving = False
+
+    def start(self, calls: Sequence[Call]) -> None:
+        """As it is, unless it dies of that."""
+        self.is_saving = any(type(call) is SerializeState for call in calls)
+        self.is_dead = self.is_dead or self.is_saving
+        if not self.is_dead:
+            super().start(calls)
+
+    def finish(self) -> Reply:
+        """The error, then nothing."""
+        return Reply([], self.error, 0.0) if self.is_saving else super().finish()
+
+
+def test_a_model_that_crashes_while_its_state_is_serialised(fresh: Iterator[SlaveLink]) -> None:
+    """It is restored, the next step is not rejected, and its state not asked for again."""
+    first = Dying(next(fresh), SlaveCrashedError("died by SIGSEGV"))
+    twin, restarts = next(fresh), []
+
+    def restart() -> SlaveLink:
+        restarts.append(1)
+        return next(fresh)
+
+    description = first.link._executor.description
+    slave = RestorableSlave("wheel", first, description, restart)
+    draw, again = random.Random(5), random.Random(5)
+    for link in (slave, twin):
+        executed(link, *BEGINNING)
+    for time in (0.0, 1e-2):
+        assert_equal(
+            executed(slave, *drawn_step(draw, time, 1e-2)),
+            executed(twin, *drawn_step(again, time, 1e-2)),
+        )
+        slave.settle()
+        if not time:
+            slave.start_saving()
+            slave.finish_saving()
+    assert len(restarts) == 1
+    assert not slave.can_serialize
 
 
 def test_a_broken_state_of_a_slave_that_cannot_be_started_again(

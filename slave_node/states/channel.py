@@ -68,7 +68,12 @@ class Channel:
         Raises:
             OSError: the other end is gone.
         """
-        self._socket.sendall(_HEADER.pack(kind, len(payload)) + payload)
+        rest = memoryview(_HEADER.pack(kind, len(payload)) + payload)
+        while rest:
+            try:
+                rest = rest[self._socket.send(rest) :]
+            except TimeoutError:  # it computes, or was stopped: that is no death
+                self._idle()
 
     def receive(self) -> tuple[Message, bytes]:
         """Wait for one message.
@@ -91,7 +96,13 @@ class Channel:
         Raises:
             OSError: the other end is gone.
         """
-        socket.send_fds(self._socket, [b"\0"], [connection.fileno()])
+        while True:
+            try:
+                socket.send_fds(self._socket, [b"\0"], [connection.fileno()])
+            except TimeoutError:
+                self._idle()
+            else:
+                return
 
     def receive_socket(self) -> socket.socket:
         """The socket that is handed over.

@@ -41,8 +41,10 @@ class HolderFamily:
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
+        self._deaths: dict[int, int] = {}
         self._obituaries, obituaries = os.pipe()
-        os.set_blocking(obituaries, False)
+        os.set_blocking(self._obituaries, False)
+        os.set_blocking(obituaries, False)  # a full pipe holds nobody up
         descriptors = (theirs.fileno(), obituaries)
         try:
             self._keeper = subprocess.Popen(
@@ -80,22 +82,37 @@ class HolderFamily:
         if self._keeper.poll() is not None:
             self._kill()
 
-    def exit_code(self, process: int) -> int | None:
-        """Of a holder whose channel is closed, -N for signal N; None where nobody can tell.
+    def forget_deaths(self) -> None:
+        """A holder is about to be made: who had its number before must not be taken for it."""
+        while self._read_death():
+            pass
+        self._deaths.clear()
 
-        ``process`` is 0 for one that nobody has met.
+    def exit_code(self, process: int) -> int | None:
+        """Exit code of a holder whose channel is closed, -N for signal N; None: not known.
+
+        ``process`` is 0 for one that was never met.
         """
         deadline = monotonic() + _OBITUARY_TIME
         reader = select.poll()
         reader.register(self._obituaries, select.POLLIN)
-        while process and (left := deadline - monotonic()) > 0.0 and reader.poll(left * 1e3):
+        while process and process not in self._deaths:
+            left = deadline - monotonic()
+            if left <= 0.0 or not reader.poll(left * 1e3) or not self._read_death():
+                return None
+        return self._deaths.get(process)
+
+    def _read_death(self) -> bool:
+        """Note one that was written down; False: there is none now, or there will be none."""
+        try:
             record = os.read(self._obituaries, OBITUARY.size)
-            if len(record) < OBITUARY.size:  # nobody is left to write one
-                break
-            pid, status = OBITUARY.unpack(record)
-            if pid == process:
-                return os.waitstatus_to_exitcode(status)
-        return None
+        except BlockingIOError:
+            return False
+        if len(record) < OBITUARY.size:  # whoever could write one is gone
+            return False
+        process, status = OBITUARY.unpack(record)
+        self._deaths[process] = os.waitstatus_to_exitcode(status)
+        return True
 
     def close(self) -> None:
         """End all of them, at once and in a bounded time. Idempotent."""

@@ -15,6 +15,7 @@ import os
 import signal
 import socket
 import sys
+import traceback
 from contextlib import suppress
 from struct import Struct
 
@@ -32,6 +33,7 @@ def main(channel: int, obituaries: int) -> None:
         channel: descriptor of the socket on which the first holder is driven.
         obituaries: descriptor of the pipe into which deaths are written.
     """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who started us
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_CHILD_SUBREAPER)")
@@ -50,6 +52,7 @@ def main(channel: int, obituaries: int) -> None:
 
 def _hold(channel: int, obituaries: int) -> None:
     """Be the first holder; does not return."""
+    exit_code = 1  # the model leaves
     try:
         os.setpgid(0, 0)
         nothing = os.open(os.devnull, os.O_RDONLY)
@@ -58,9 +61,14 @@ def _hold(channel: int, obituaries: int) -> None:
         from slave_node.states.fork_holder import hold  # noqa: PLC0415  not in the keeper
 
         hold(socket.socket(fileno=channel), obituaries)
+    except Exception:
+        traceback.print_exc()
+        from slave_node.deaths import OWN_FAILURE  # noqa: PLC0415  as above
+
+        exit_code = OWN_FAILURE
     finally:
         sys.stderr.flush()
-        os._exit(1)
+        os._exit(exit_code)
 
 
 def report(obituaries: int, pid: int, status: int) -> None:

@@ -160,7 +160,7 @@ class ForkSlave(Slave):
 
     def _holder(self) -> HeldProcess:
         if self._active is None:
-            raise SlaveCrashedError(
+            raise SlaveKilledError(
                 "the process that held the model is gone",
                 remedy="restore a saved state, or reset the slave",
             )
@@ -172,18 +172,22 @@ class ForkSlave(Slave):
         """What the holder answers; with ``copy_behind`` it then makes a copy.
 
         Raises:
-            SlaveCrashedError: it died.
+            SlaveCrashedError: it died of that.
+            SlaveKilledError: it died of something else, or nothing tells of what.
         """
         holder = self._holder()
         try:
-            holder.send(kind, payload)
-            if copy_behind:
-                self._ahead = holder.copy()
-            return holder.receive()
-        except (EOFError, OSError):
-            self._drop_active()
-            raise holder.death() from None
-        except BaseException:  # Ctrl-C: what it answers would be for nobody
+            try:
+                holder.send(kind, payload)
+            except OSError:
+                raise holder.loss() from None
+            try:
+                if copy_behind:
+                    self._ahead = holder.copy()
+                return holder.receive()
+            except (EOFError, OSError):
+                raise holder.death() from None
+        except BaseException:  # also Ctrl-C: what it answers would be for nobody
             self._drop_active()
             raise
 
@@ -191,7 +195,7 @@ class ForkSlave(Slave):
         """Let the holder do something, and prepare what is likely to come after it.
 
         Raises:
-            SlaveCrashedError: it died.
+            SlaveCrashedError: as `_exchange`.
             SlaveError: a state that was to be saved before could not be.
         """
         self._drop_ahead()
@@ -302,7 +306,7 @@ class ForkSlave(Slave):
         Raises:
             StepRejectedError: also then, if there is a saved state to go back to.
             FatalSlaveError: if there is none.
-            SlaveKilledError: its process was killed from outside, which says nothing of the step.
+            SlaveKilledError: its process died, and not known to be by the step.
         """
         step = DoStep(communication_point, step_size, no_set_state_prior)
         try:
@@ -457,8 +461,10 @@ class ForkSlave(Slave):
         try:
             copy = copy or holder.copy()
         except OSError:
-            self._drop_active()
-            raise holder.death() from None
+            try:
+                raise holder.loss() from None
+            finally:
+                self._drop_active()
         if self._has_forked:
             self._unconfirmed.append(copy)
         else:
@@ -485,7 +491,7 @@ class ForkSlave(Slave):
         try:
             copy = _copy_from_origin(state)
         except OSError:
-            raise state.origin.death() from None
+            raise state.origin.loss() from None
         _meet(copy)
         return copy
 

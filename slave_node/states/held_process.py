@@ -6,8 +6,8 @@ import socket
 from collections import deque
 
 from protocol.codec import decode_reply
-from protocol.errors import DoublestepError, SlaveCrashedError, SlaveError
-from slave_node.deaths import death
+from protocol.errors import DoublestepError, SlaveCrashedError, SlaveError, SlaveKilledError
+from slave_node.deaths import death, how_ended
 from slave_node.states.channel import DURATION, PROCESS, Message
 from slave_node.states.fork_family import HolderFamily
 from slave_node.states.fork_trail import Task, Trail
@@ -49,7 +49,7 @@ class HeldProcess:
 
         Raises:
             EOFError, OSError: it is gone.
-            SlaveError: it never was there, see `meet`.
+            SlaveError: as `meet`.
         """
         self.meet()
         return self._channel.receive()
@@ -64,6 +64,7 @@ class HeldProcess:
         Raises:
             OSError: it is gone.
         """
+        self._family.forget_deaths()
         ours, theirs = socket.socketpair()
         with theirs:
             try:
@@ -88,7 +89,8 @@ class HeldProcess:
         """Wait until it is there, and has done all again that it was to follow.
 
         Raises:
-            SlaveCrashedError: it, or its original, died before.
+            SlaveKilledError: it, or its original, died before: whatever comes next is not to
+                blame.
             SlaveError: it could not be forked; or it did not end where it ended the first time.
         """
         try:
@@ -103,13 +105,35 @@ class HeldProcess:
                 if kind is not Message.DONE or answer[DURATION.size :] != task.answer:
                     raise _did_not_repeat(task)
         except (EOFError, OSError):
-            raise self.death() from None
+            raise self._never_met() from None
         self._original = None
 
     def death(self) -> SlaveCrashedError:
-        """The error that it is gone, and how it died; or its original, if it was never there."""
-        dead = self if self._process or self._original is None else self._original
-        return death(self._family.exit_code(dead._process))
+        """The error that it died of what it was asked; not to be closed before.
+
+        Raises:
+            SlaveError: as `meet`.
+        """
+        self.meet()  # it may have told its number and died then
+        return death(self._family.exit_code(self._process))
+
+    def loss(self) -> SlaveKilledError:
+        """The error that it died while it was asked for nothing; not to be closed before.
+
+        Raises:
+            SlaveError: as `meet`.
+        """
+        self.meet()
+        return SlaveKilledError(
+            f"the process that held the model {how_ended(self._family.exit_code(self._process))}"
+        )
+
+    def _never_met(self) -> SlaveKilledError:
+        """The error that it died before it stood where it was to stand."""
+        who, process = "the process that was to hold a saved state", self._process
+        if not process and self._original is not None:
+            who, process = f"{who} is not there: its original", self._original._process
+        return SlaveKilledError(f"{who} {how_ended(self._family.exit_code(process))}")
 
     def close(self) -> None:
         """Let it end. Idempotent."""
