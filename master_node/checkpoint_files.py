@@ -22,11 +22,16 @@ from typing import Any, NamedTuple
 from zlib import crc32
 
 from master_node.call_log import CallLog, LoggedStep, SavedState
-from master_node.results.files import cannot_read, cannot_write, malformed, replacing
+from master_node.results.files import (
+    CHECKPOINT_FOLDER,
+    cannot_read,
+    cannot_write,
+    malformed,
+    replacing,
+    synchronize_folder,
+)
 from protocol.archives import UNREADABLE, bounded_archive, read_entry
 from protocol.errors import DoublestepError, ResultsError
-
-CHECKPOINT_FOLDER = "checkpoint"
 
 _SYSTEM_FILE = "system.json"
 _RUN_FILE = "run.zip"
@@ -118,6 +123,8 @@ class CheckpointStore:
             self._folder.mkdir()
             with replacing(self._folder / _SYSTEM_FILE) as file:
                 file.write(json.dumps(self.system, indent=2).encode())
+            synchronize_folder(self._folder)
+            synchronize_folder(self.directory)
         except OSError as error:
             raise cannot_write(self._folder, error) from error
 
@@ -154,21 +161,24 @@ class CheckpointStore:
                 for name, slave in checkpoint.slaves.items():
                     if slave.state is not None:
                         archive.writestr(f"{name}.state", slave.state.data)
-            self._synchronize()
+            synchronize_folder(self._folder)
         except OSError as error:
             raise cannot_write(path, error) from error
         self._remove_old(calls)
         self._calls = calls
 
-    def load(self) -> tuple[Mapping[str, Any], Checkpoint]:
-        """The system, and where its run stood.
+    def load(self) -> tuple[Mapping[str, Any], Checkpoint | None]:
+        """The system, and where its run stood; None: it was broken off before that was written.
 
         Raises:
-            ResultsError: there is no checkpoint, or it cannot be read.
+            ResultsError: no run began to step here, or a file cannot be read.
         """
-        path = self._folder / _RUN_FILE
+        path = self._folder / _SYSTEM_FILE
         try:
-            system = json.loads((self._folder / _SYSTEM_FILE).read_bytes())
+            system = json.loads(path.read_bytes())
+            path = self._folder / _RUN_FILE
+            if not path.exists():
+                return system, None
             with bounded_archive(path) as archive:
                 header = json.loads(read_entry(archive, _RUN, _LARGEST))
                 if header["version"] != _VERSION:
@@ -239,13 +249,3 @@ class CheckpointStore:
             if name in calls and old.first != calls[name].first:
                 with suppress(OSError):
                     self._path(name, old).unlink()
-
-    def _synchronize(self) -> None:
-        """A file that was renamed is there after a power failure only when its folder is."""
-        if os.name != "posix":
-            return
-        folder = os.open(self._folder, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)

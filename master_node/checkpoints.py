@@ -223,17 +223,19 @@ class Checkpoints:
             self._write()
             self._written = monotonic()
 
-    def end(self, *, is_complete: bool) -> None:
-        """The run has ended; unless it is complete, it can be resumed from where it stood last."""
-        if self._store is None:
-            return
-        if is_complete or self._place is None:
-            self._store.remove()
+    def broken_off(self) -> None:
+        """The run did not get to its end: it can be resumed from where it stood last."""
+        if self._store is None or self._place is None:
             return
         try:
             self._write()
         except ResultsError as error:
             log.warning("%s; resume would go on from the checkpoint before", error)
+
+    def remove(self) -> None:
+        """The run got to its end, and its results are complete: nothing is to be resumed."""
+        if self._store is not None:
+            self._store.remove()
 
     def _is_due(self) -> bool:
         now = monotonic()

@@ -218,18 +218,15 @@ def run(  # noqa: PLR0917  options of the command line
         observers: list[Observer] = [ProgressBar(quiet=quiet or log_format is LogFormat.JSON)]
         if metrics_port is not None:
             observers.append(_served_metrics(stack, metrics_port, metrics_host))
-        try:
-            run_system(
-                system,
-                output,
-                in_process=in_process,
-                launch=not no_launch,
-                observers=observers,
-                uploading=stack.enter_context(UploadBar(quiet=quiet)),
-                trace=trace,
-            )
-        except KeyboardInterrupt:
-            raise InterruptedRunError("interrupted before the first step") from None
+        run_system(
+            system,
+            output,
+            in_process=in_process,
+            launch=not no_launch,
+            observers=observers,
+            uploading=stack.enter_context(UploadBar(quiet=quiet)),
+            trace=trace,
+        )
         _show(output, quiet=quiet, no_plot=no_plot)
 
 
@@ -271,10 +268,7 @@ def resume(
         from master_node.progress import ProgressBar  # noqa: PLC0415
         from master_node.simulation import resume as resume_run  # noqa: PLC0415
 
-        try:
-            resume_run(directory, observers=(ProgressBar(quiet=quiet),))
-        except KeyboardInterrupt:
-            raise InterruptedRunError("interrupted before the next step") from None
+        resume_run(directory, observers=(ProgressBar(quiet=quiet),))
         _show(directory, quiet=quiet, no_plot=no_plot)
 
 

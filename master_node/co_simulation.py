@@ -215,8 +215,10 @@ class CoSimulation:
             message = str(error)
             raise
         finally:
-            self.checkpoints.end(is_complete=outcome.is_complete)
+            if not outcome.is_complete:
+                self.checkpoints.broken_off()
             self.observer.ended(RunEnd(outcome, statistics, message))
+        self.checkpoints.remove()
         return statistics
 
     def _steps(

@@ -18,6 +18,7 @@ from master_node.co_simulation import CoSimulation, check_capabilities
 from master_node.configuration import InputSettings, System
 from master_node.configure_slaves import configure
 from master_node.examinations import as_plain_data
+from master_node.external_resolution import Signals
 from master_node.input_loading import load_signals
 from master_node.model_hashes import check_hashes
 from master_node.observers import Observer, Observers
@@ -31,6 +32,8 @@ from master_node.results import (
     SelectionMemory,
     check_variables,
     exclusive,
+    finish,
+    is_complete,
 )
 from master_node.resumption import RunMode, can_be_saved, check_models, reopened, saved_system
 from master_node.slave_group import SlaveGroup
@@ -39,6 +42,7 @@ from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
 from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.system import resolve
 from master_node.trace import TraceWriter
+from protocol.errors import InterruptedRunError
 from protocol.slave import SlaveDescription
 
 log = logging.getLogger("master_node")
@@ -115,22 +119,35 @@ def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None
     """Go on with a run whose master was interrupted or killed, or that failed.
 
     Its results continue those in the directory, and end up the same, bit for bit, as if nothing
-    had happened.
+    had happened. One that was broken off before its first checkpoint begins anew. Of one that got
+    to its end and no further what its results lack is made.
 
     Args:
         directory: with the results and the checkpoint of the run.
         observers: are told of everything that happens from there on.
 
     Raises:
-        ResultsError: there is no checkpoint, a file cannot be read, or another run writes there.
+        ResultsError: there is nothing to go on with, a file cannot be read, or another run writes
+            there.
         ConfigurationError: a model or a table is not the one with which the run began.
         DoublestepError: as `simulate`.
     """
     directory = Path(directory)
     store = CheckpointStore(directory)
     with exclusive(directory):
+        if finish(directory):
+            log.info("the run had got to its end: its results are complete now")
+            store.remove()
+            return
         saved, checkpoint = store.load()
-        resumption = Resumption(saved, store, Resumed.of(checkpoint))
+        if is_complete(directory):  # its master was killed just then
+            store.remove()
+            return
+        if checkpoint is None:
+            log.info("the run was broken off before its first checkpoint: it begins anew")
+            resumption = Resumption(saved, CheckpointStore(directory, saved), None)
+        else:
+            resumption = Resumption(saved, store, Resumed.of(checkpoint))
         with reopened(saved) as (system, mode):
             _run(system, directory, mode, observers, resumption=resumption)
 
@@ -142,12 +159,12 @@ class Resumption:
     Attributes:
         saved: what was run.
         store: of its checkpoints.
-        resumed: where it goes on.
+        resumed: where it goes on; None: at its start.
     """
 
     saved: Mapping[str, Any]
     store: CheckpointStore
-    resumed: Resumed
+    resumed: Resumed | None
 
 
 def _run(
@@ -161,66 +178,87 @@ def _run(
     uploading: Uploading | None = None,
     trace: Path | None = None,
 ) -> None:
-    settings = settings_of(system, {})
-    check_step_sizes(system)
-    signals = load_signals(system)
-    if directory is not None:
-        ResultsWriter(directory, settings).prepare()
-    with ExitStack() as stack:
-        if directory is not None and resumption is None:
-            stack.enter_context(exclusive(directory))
-        traces = [] if trace is None else [stack.enter_context(closing(TraceWriter(trace)))]
-        slaves = stack.enter_context(_slaves(system, directory, mode, uploading))
-        if resumption is not None:
-            check_models(resumption.saved, slaves.descriptions)
-        check_hashes(system, slaves.descriptions)
-        restorable = _restorable(slaves, system, directory)
-        links: dict[str, SlaveLink] = dict(slaves.links)
-        links |= {slave.name: slave for slave in restorable}
-        given = system
-        descriptions = configure(links, system, slaves.descriptions)
-        system = with_fixed_steps(system, descriptions)
+    moment = f"before the {'first' if resumption is None else 'next'} step"
+    try:
         check_step_sizes(system)
-        warnings = check_capabilities(resolve(system, descriptions, signals), system)
-        for warning in warnings:
+        signals = load_signals(system)
+        with ExitStack() as stack:
+            if directory is not None:
+                ResultsWriter(directory, settings_of(system, {})).prepare()
+                if resumption is None:
+                    stack.enter_context(exclusive(directory))
+            traces = [] if trace is None else [stack.enter_context(closing(TraceWriter(trace)))]
+            slaves = stack.enter_context(_slaves(system, directory, mode, uploading))
+            _co_simulation(
+                system, signals, directory, mode, observers, slaves, traces, recording, resumption
+            ).run()
+            moment = "after the last step; the results are complete"
+    except KeyboardInterrupt:
+        raise InterruptedRunError(f"interrupted {moment}") from None
+
+
+def _co_simulation(  # noqa: PLR0917  what a run is made of
+    system: System,
+    signals: Signals,
+    directory: Path | None,
+    mode: RunMode,
+    observers: Sequence[Observer],
+    slaves: Slaves,
+    traces: Sequence[TraceWriter],
+    recording: Recording | None,
+    resumption: Resumption | None,
+) -> CoSimulation:
+    """The run, ready to begin."""
+    if resumption is not None:
+        check_models(resumption.saved, slaves.descriptions)
+    check_hashes(system, slaves.descriptions)
+    restorable = _restorable(slaves, system, directory)
+    links: dict[str, SlaveLink] = dict(slaves.links)
+    links |= {slave.name: slave for slave in restorable}
+    given = system
+    descriptions = configure(links, system, slaves.descriptions)
+    system = with_fixed_steps(system, descriptions)
+    check_step_sizes(system)
+    warnings = check_capabilities(resolve(system, descriptions, signals), system)
+    for warning in warnings:
+        log.warning("%s", warning)
+    group = SlaveGroup(links, traces)
+    prepared = prepare(group, system, descriptions, signals)
+    coupled = resolve(prepared.system, prepared.descriptions, signals)
+    for warning in check_capabilities(coupled, prepared.system):
+        if warning not in warnings:
             log.warning("%s", warning)
-        group = SlaveGroup(links, traces)
-        prepared = prepare(group, system, descriptions, signals)
-        coupled = resolve(prepared.system, prepared.descriptions, signals)
-        for warning in check_capabilities(coupled, prepared.system):
-            if warning not in warnings:
-                log.warning("%s", warning)
-        wanted = system.results
-        check_variables(
-            wanted.variables, (*coupled.output_names, *coupled.discrete.names), system.source
-        )
-        resumed = None if resumption is None else resumption.resumed
-        store = None
-        if resumption is not None:
-            store = resumption.store
-        elif directory is not None and _writes_checkpoints(given):
-            store = CheckpointStore(directory, saved_system(given, mode, slaves.descriptions))
-        keepers: list[Observer] = [] if recording is None else [recording]
-        writer = None
-        if directory is not None:
-            settings = settings_of(prepared.system, prepared.descriptions)
-            settings["examinations"] = as_plain_data(prepared.examinations)
-            rows = None if resumed is None else resumed.rows
-            writer = ResultsWriter(directory, settings, rows, can_resume=store is not None)
-            keepers.append(writer)
-        selection = SelectionMemory() if resumed is None else resumed.files.selection
-        selected = SelectedResults(Observers(keepers), wanted.variables, wanted.every, selection)
-        observer = Observers([*observers, *traces, selected])
-        checkpoints = Checkpoints(
-            restorable,
-            store,
-            system.simulation.checkpoint_interval,
-            None if writer is None else _ResultFiles(writer, selected),
-            0 if resumed is None else resumed.checkpoint.number,
-        )
-        CoSimulation(
-            group, coupled, prepared.system, observer, prepared.outputs, checkpoints, resumed
-        ).run()
+    wanted = system.results
+    check_variables(
+        wanted.variables, (*coupled.output_names, *coupled.discrete.names), system.source
+    )
+    resumed = None if resumption is None else resumption.resumed
+    store = None
+    if resumption is not None:
+        store = resumption.store
+    elif directory is not None and _writes_checkpoints(given):
+        store = CheckpointStore(directory, saved_system(given, mode, slaves.descriptions))
+    keepers: list[Observer] = [] if recording is None else [recording]
+    writer = None
+    if directory is not None:
+        settings = settings_of(prepared.system, prepared.descriptions)
+        settings["examinations"] = as_plain_data(prepared.examinations)
+        rows = None if resumed is None else resumed.rows
+        writer = ResultsWriter(directory, settings, rows, can_resume=store is not None)
+        keepers.append(writer)
+    selection = SelectionMemory() if resumed is None else resumed.files.selection
+    selected = SelectedResults(Observers(keepers), wanted.variables, wanted.every, selection)
+    observer = Observers([*observers, *traces, selected])
+    checkpoints = Checkpoints(
+        restorable,
+        store,
+        system.simulation.checkpoint_interval,
+        None if writer is None else _ResultFiles(writer, selected),
+        0 if resumed is None else resumed.checkpoint.number,
+    )
+    return CoSimulation(
+        group, coupled, prepared.system, observer, prepared.outputs, checkpoints, resumed
+    )
 
 
 def _writes_checkpoints(system: System) -> bool:

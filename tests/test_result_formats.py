@@ -489,7 +489,7 @@ def test_what_cannot_be_made_at_the_end_leaves_the_stream(tmp_path: Path, format
     assert not list(tmp_path.glob(".*.part"))
     result = Result.load(tmp_path)
     holds(result, START, points)
-    assert result.summary["outcome"] == "completed"
+    assert (result.summary["outcome"], result.summary["message"]) == ("failed", str(caught.value))
 
 
 FULL = """
@@ -537,7 +537,7 @@ def test_full_disk_leaves_whole_batches(
     n = len(result.time) - 1
     assert n > 50
     holds(result, START, some_points(n))
-    assert result.summary["outcome"] == "completed"
+    assert result.summary["outcome"] == "failed"
 
 
 # --- MAT ----------------------------------------------------------------------------------------

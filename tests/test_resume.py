@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,6 +26,8 @@ from master_node.numerics.order_control import OrderMemory
 from master_node.observers import Attempt
 from master_node.outputs import Outputs
 from master_node.plain_values import from_plain, to_plain
+from master_node.results import completion
+from master_node.results.files import cannot_write
 from protocol.errors import ConfigurationError, InterruptedRunError, ResultsError
 from tests.quarter_car_case import EXAMPLES
 from tests.test_processes import (
@@ -166,6 +170,140 @@ def test_parquet_alone(tmp_path: Path) -> None:
     assert files == {"results.parquet", "steps.csv", "summary.json"}
 
 
+# ---- The end ------------------------------------------------------------------------------------
+
+
+class Untold:
+    """An observer of a run that takes no step."""
+
+    def started(self, _: object) -> None:
+        """Never."""
+        raise AssertionError("the run was done again")
+
+    attempted = ended = started
+
+
+KILLED = """
+import os, signal, sys
+from master_node import load_system, simulate
+from master_node.results import completion
+setattr(completion, sys.argv[1], lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+simulate(load_system(sys.argv[2]), output=sys.argv[3], in_process=True)
+"""
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _disk_full(path: Path, *_: object) -> None:
+    raise cannot_write(path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+
+
+@pytest.mark.parametrize("what", ["_make_parquet", "_make_mat"])
+@pytest.mark.parametrize("interval", [60, 0])
+@pytest.mark.parametrize("accident", ["kill", "Ctrl-C", "full disk"])
+def test_results_that_were_not_completed(
+    what: str, interval: int, accident: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Broken off while Parquet or MAT is made: resume makes them, and takes no step again.
+
+    Until then all rows can be read, and nothing says that the run is complete.
+    """
+    settings = f"stop_time = 0.3\ncheckpoint_interval = {interval}\n"
+    system = car(tmp_path, settings, "formats = ['csv', 'parquet', 'mat']\n")
+    out = tmp_path / "out"
+    simulate(system, output=tmp_path / "whole", in_process=True)
+    if accident == "kill":
+        words = [sys.executable, "-c", KILLED, what, str(tmp_path / "car.toml"), str(out)]
+        assert subprocess.run(words, timeout=60, check=False).returncode == -signal.SIGKILL
+        assert Result.load(out).summary == {}
+    else:
+        error, words = (
+            (InterruptedRunError, "while the results were completed; all rows are there")
+            if accident == "Ctrl-C"
+            else (ResultsError, "No space left on device; free space")
+        )
+        with monkeypatch.context() as patch:
+            patch.setattr(completion, what, _interrupt if accident == "Ctrl-C" else _disk_full)
+            remedy = f"`master-node resume {out}` completes them$"
+            with pytest.raises(error, match=f"{words}.*; (then )?{remedy}"):
+                simulate(system, output=out, in_process=True)
+            outcome = Result.load(out).summary.get("outcome")
+            assert outcome == (None if accident == "Ctrl-C" else "failed")
+    assert contents(out) == contents(tmp_path / "whole")
+    resume(out, observers=(Untold(),))
+    assert_complete(out, tmp_path / "whole")
+
+
+def assert_complete(out: Path, whole: Path) -> None:
+    """The same files, and the same in them."""
+    assert {p.name for p in out.iterdir()} == {p.name for p in whole.iterdir()}
+    names = [p.name for p in whole.iterdir() if p.suffix in (".csv", ".parquet", ".mat")]
+    assert {name: (out / name).read_bytes() for name in names} == {
+        name: (whole / name).read_bytes() for name in names
+    }
+    assert Result.load(out).summary["outcome"] == "completed"
+
+
+def test_a_master_that_is_killed_at_its_very_end(tmp_path: Path) -> None:
+    """Results are complete before the checkpoint goes; resume only removes it then."""
+    out = broken_off(tmp_path)
+    shutil.copytree(out / "checkpoint", tmp_path / "checkpoint")
+    resume(out)
+    files = {path.name: path.read_bytes() for path in out.iterdir()}
+    shutil.copytree(tmp_path / "checkpoint", out / "checkpoint")
+    resume(out, observers=(Untold(),))
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == files
+
+
+@pytest.mark.parametrize("interval", [60.0, 0.05])
+def test_a_disk_that_is_full_for_the_last_rows(interval: float, tmp_path: Path) -> None:
+    """The run has failed, and its rows are whole; with room it goes on to the same bytes."""
+    settings = f"stop_time = 2.0\nlargest_step_size = 1e-3\ncheckpoint_interval = {interval}\n"
+    system = car(tmp_path, settings)
+    out = tmp_path / "out"
+    simulate(system, output=tmp_path / "whole", in_process=True)
+    limit = (tmp_path / "whole" / "results.csv").stat().st_size - 10
+    code = (
+        f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}));"
+        "from master_node import load_system, simulate;"
+        f"simulate(load_system({str(tmp_path / 'car.toml')!r}), output={str(out)!r},"
+        " in_process=True)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert "ResultsError: cannot write" in done.stderr
+    assert Result.load(out).summary["outcome"] == "failed"
+    resume(out)
+    assert contents(out) == contents(tmp_path / "whole")
+    assert not (out / "checkpoint").exists()
+
+
+def test_a_run_that_was_broken_off_before_its_first_checkpoint(tmp_path: Path) -> None:
+    """Not even the place of T_0 was written: it begins anew, to the same bits."""
+    system = car(tmp_path, "stop_time = 0.3\n")
+    simulate(system, output=tmp_path / "whole", in_process=True)
+    out = broken_off(tmp_path)
+    (out / "checkpoint" / "run.zip").unlink()
+    with pytest.raises(InterruptedRunError, match="interrupted at t="):
+        resume(out, observers=(Interrupt(5),))
+    resume(out)
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_ctrl_c_before_a_resumed_run_has_begun(tmp_path: Path) -> None:
+    """The checkpoint from which it would have gone on stays."""
+    out = broken_off(tmp_path)
+    observer = Interrupt(1)
+    observer.started = _interrupt  # type: ignore[method-assign]
+    with pytest.raises(InterruptedRunError, match="before the next step"):
+        resume(out, observers=(observer,))
+    resume(out)
+    assert Result.load(out).summary["outcome"] == "completed"
+
+
 # ---- Real processes -----------------------------------------------------------------------------
 
 
@@ -275,6 +413,18 @@ def test_a_new_run_replaces_the_checkpoint(tmp_path: Path) -> None:
     out = broken_off(tmp_path)
     system = load_system(tmp_path / "car.toml").with_simulation(stop_time=0.2)
     simulate(system, output=out, in_process=True)
+    with pytest.raises(ResultsError, match="holds no checkpoint"):
+        resume(out)
+
+
+def test_a_new_run_without_checkpoints_leaves_none_of_an_old_one(tmp_path: Path) -> None:
+    """What would be resumed is another run than that of the results beside it."""
+    out = broken_off(tmp_path)
+    system = load_system(tmp_path / "car.toml").with_simulation(
+        checkpoint_interval=0.0, relative_tolerance=1e-6
+    )
+    with pytest.raises(InterruptedRunError):
+        simulate(system, output=out, in_process=True, observers=(Interrupt(9),))
     with pytest.raises(ResultsError, match="holds no checkpoint"):
         resume(out)
 

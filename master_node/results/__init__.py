@@ -18,6 +18,7 @@ In the CSV files numbers are written with ``repr``, the shortest text that reads
 bits: equal numbers give equal files, byte for byte.
 """
 
+from master_node.results.completion import finish, is_complete
 from master_node.results.exclusive import exclusive
 from master_node.results.files import (
     ARROW_FILE,
@@ -52,5 +53,7 @@ __all__ = [
     "check_variables",
     "chosen",
     "exclusive",
+    "finish",
+    "is_complete",
     "summarize",
 ]

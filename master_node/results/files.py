@@ -27,11 +27,18 @@ START_FILE = ".start.json"
 STREAM_FILE = ".results.arrow"
 """Stands in for results.arrow while a run without it goes on that ends with Parquet or MAT."""
 
+END_FILE = ".end.json"
+"""The summary of a run that got to its end, while its results are not complete."""
+
+CHECKPOINT_FOLDER = "checkpoint"
+"""Where a run stood that can be resumed, see ``checkpoint_files.py``."""
+
 _UNFINISHED = "{}.part"
 _MAX_GROWTH = 1000
 _GROWTH_FREE_BYTES = 2**30
 
 FILES = (
+    END_FILE,  # first, as it needs the others
     SUMMARY_FILE,
     RESULTS_FILE,
     ARROW_FILE,
@@ -43,7 +50,7 @@ FILES = (
     STREAM_FILE,
     *map(
         _UNFINISHED.format,
-        (ARROW_FILE, STREAM_FILE, PARQUET_FILE, MAT_FILE, SUMMARY_FILE, START_FILE),
+        (ARROW_FILE, STREAM_FILE, PARQUET_FILE, MAT_FILE, SUMMARY_FILE, START_FILE, END_FILE),
     ),
 )
 """All that a run may leave and the next one in the same directory replaces."""
@@ -187,6 +194,24 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         with suppress(OSError):
             unfinished.unlink(missing_ok=True)
         raise
+
+
+def synchronize_folder(folder: Path) -> None:
+    """Bring the names of its files to the disk: after a power failure they are there only then.
+
+    Raises:
+        ResultsError: the disk refuses.
+    """
+    if os.name != "posix":
+        return
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
 
 
 def one_field(text: str) -> str:

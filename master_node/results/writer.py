@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -12,9 +13,16 @@ from time import monotonic
 
 from master_node.observers import Attempt, Point, Points, RunEnd, RunStart
 from master_node.results.columns import Columns
+from master_node.results.completion import (
+    complete,
+    convert,
+    failed,
+    is_made_at_the_end,
+    stream_of,
+)
 from master_node.results.csv_file import CsvFile
 from master_node.results.files import (
-    ARROW_FILE,
+    CHECKPOINT_FOLDER,
     FILES,
     MAT_FILE,
     PARQUET_FILE,
@@ -79,7 +87,6 @@ class ResultsWriter:
         self._next_flush = 0.0
         self._broken = False
         self._resumed = resumed
-        self._keeps_stream = False
         self._can_resume = can_resume
         self._points, self._attempts = resumed or (0, 0)
 
@@ -157,47 +164,32 @@ class ResultsWriter:
         if self._start is None:
             return
         told = self._broken
-        errors: list[ResultsError] = []
         summary = summarize(self._start, end, self._settings)
         self._append(end.points)
-        self._keeps_stream = self._can_resume and not end.outcome.is_complete
-        for finish in (
-            self._flush,
-            self._close,
-            self._convert,
-            lambda: self._write_summary(summary),
-        ):
-            try:
-                finish()
-            except ResultsError as error:  # each file gets its chance: the disk may have room
-                errors.append(error)
+        errors = _errors_of(self._flush, self._close)
+        if end.outcome.is_complete and not errors:
+            complete(self._directory, summary)
+            return
+        if end.outcome.is_complete:
+            summary = failed(summary, errors[0])
+        errors += _errors_of(self._convert, lambda: self._write_summary(summary))
         if errors and not told:
             raise errors[0]
-
-    @property
-    def _stream(self) -> Path:
-        """The file that Parquet and MAT are made from."""
-        return self._directory / (ARROW_FILE if "arrow" in self._formats else STREAM_FILE)
-
-    @property
-    def _made_at_the_end(self) -> bool:
-        return "parquet" in self._formats or "mat" in self._formats
 
     def _open_files(self, columns: Columns) -> None:
         path = self._directory
         points, attempts = self._resumed or (None, None)
         try:
             if self._resumed is None:
-                for path in map(self._directory.joinpath, FILES):
-                    path.unlink(missing_ok=True)
+                self._remove_old()
             if "csv" in self._formats:
                 path = self._directory / RESULTS_FILE
                 self._results.append(CsvFile(path, columns, points))
-            if "arrow" in self._formats or self._made_at_the_end:
+            if "arrow" in self._formats or is_made_at_the_end(self._settings):
                 # pyarrow takes a tenth of a second to import, which other runs need not pay
                 from master_node.results.arrow_file import ArrowFile  # noqa: PLC0415
 
-                path = self._stream
+                path = stream_of(self._directory, self._formats)
                 hash_ = settings_sha256(self._settings)
                 self._results.append(ArrowFile(path, columns, hash_, points))
             path = self._directory / STEPS_FILE
@@ -207,6 +199,16 @@ class ResultsWriter:
                     path.unlink(missing_ok=True)
         except OSError as error:
             raise cannot_write(path, error) from error
+
+    def _remove_old(self) -> None:
+        """All of an earlier run; first where it stood, as that means nothing without the rest."""
+        shutil.rmtree(self._directory / CHECKPOINT_FOLDER, ignore_errors=True)
+        for name in FILES:
+            path = self._directory / name
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise cannot_write(path, error) from error
 
     def _append(self, points: Points) -> None:
         self._points += len(points)
@@ -240,34 +242,28 @@ class ResultsWriter:
             raise errors[0]
 
     def _convert(self) -> None:
-        """Parquet and MAT; where one fails, the stream stays in their place."""
-        if not self._made_at_the_end:
+        """Parquet and MAT of a run that did not get to its end; where one fails, the stream stays
+        in their place.
+        """
+        if not is_made_at_the_end(self._settings):
             return
-        errors: list[ResultsError] = []
-        for format_, make in (("parquet", self._make_parquet), ("mat", self._make_mat)):
-            if format_ in self._formats:
-                try:
-                    make()
-                except ResultsError as error:
-                    errors.append(error)
-        if errors:
-            raise errors[0]
-        if self._keeps_stream:
-            return
-        with suppress(OSError):
-            (self._directory / STREAM_FILE).unlink(missing_ok=True)
-
-    def _make_parquet(self) -> None:
-        from master_node.results.parquet_file import write_parquet  # noqa: PLC0415  as pyarrow
-
-        write_parquet(self._directory / PARQUET_FILE, self._stream)
-
-    def _make_mat(self) -> None:
-        from master_node.results.dymola_mat import constants_of, write_mat  # noqa: PLC0415  as above
-
-        write_mat(self._directory / MAT_FILE, self._stream, constants_of(self._settings))
+        convert(self._directory, self._settings)
+        if not self._can_resume:
+            with suppress(OSError):
+                (self._directory / STREAM_FILE).unlink(missing_ok=True)
 
     def _write_summary(self, summary: Mapping[str, object]) -> None:
         write_json(self._directory / SUMMARY_FILE, summary)
         with suppress(OSError):
             (self._directory / START_FILE).unlink(missing_ok=True)
+
+
+def _errors_of(*actions: Callable[[], None]) -> list[ResultsError]:
+    """Of actions that all get their chance: the disk may have room for one and not for another."""
+    errors = []
+    for action in actions:
+        try:
+            action()
+        except ResultsError as error:
+            errors.append(error)
+    return errors
