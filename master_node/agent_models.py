@@ -21,7 +21,7 @@ from protocol.agents import (
 )
 from protocol.bus import Bus
 from protocol.errors import ModelError, ProtocolError, SlaveLostError
-from protocol.files import file_sha256
+from protocol.files import Contents, as_file, is_fmu
 from protocol.keys import MODELS, UPLOAD, AgentKey
 
 log = logging.getLogger("master_node")
@@ -59,7 +59,7 @@ class WantedModel:
 
     Attributes:
         slave: its name.
-        file: the model's file here; None: there is none.
+        file: the model's file, or the folder of an FMU, here; None: there is none.
         name: of the model's file, without folders.
         python_class: of a Python model, with its colon; empty for an FMU.
         sha256, size: of ``file``; empty and 0 without it.
@@ -81,16 +81,15 @@ def wanted_model(system: System, slave: str) -> WantedModel:
     """
     model = str(system.slaves[slave].model)
     place, colon, python_class = model.rpartition(":")
-    is_python = bool(colon) and not model.lower().endswith(".fmu")
-    path = place if is_python else model
+    is_python = bool(colon) and not is_fmu(model, system.base)
+    path = place if is_python else model.rstrip("/\\")
     python_class = f":{python_class}" if is_python else ""
     file_name = path.replace("\\", "/").rpartition("/")[2]
     file = system.base / path
     try:
-        if (is_python and not path.endswith(".py")) or not file.is_file():
+        if (is_python and not path.endswith(".py")) or not file.exists():
             return WantedModel(slave, None, file_name, python_class)
-        digest = file_sha256(file)
-        size = file.stat().st_size
+        digest, size = Contents.of(file)
     except OSError as error:
         raise ModelError(f"{file} cannot be read: {error}", slave=slave) from error
     return WantedModel(slave, file, file_name, python_class, digest, size)
@@ -183,7 +182,7 @@ class ModelPlacing:
         """Send the pieces that are not there yet; goes on after a lost connection."""
         log.info("sending %s (%d bytes) to agent %s", wanted.name, wanted.size, agent.key.name)
         try:
-            with file.open("rb") as source:
+            with as_file(file) as packed, packed.open("rb") as source:
                 state = self._piece(agent.key, Upload(wanted.sha256, wanted.size, 0, b""))
                 while not state.complete:
                     offset = state.received

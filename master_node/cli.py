@@ -70,7 +70,10 @@ Results = Annotated[
 @app.command()
 def run(  # noqa: PLR0917  options of the command line
     system_file: Annotated[
-        Path, typer.Argument(metavar="SYSTEM", help="What to run: a .toml, .ssp or .ssd file.")
+        Path,
+        typer.Argument(
+            metavar="SYSTEM", help="A .toml, .ssp or .ssd file, or PACKAGE.ssp#VARIANT.ssd."
+        ),
     ],
     output: Annotated[Path, typer.Option(help="Directory for the results.")] = Path("results"),
     preset: Annotated[
@@ -371,7 +374,10 @@ def compare(
 @app.command("import")
 def import_(
     package: Annotated[
-        Path, typer.Argument(metavar="SYSTEM.ssp", help="A package, or an .ssd file.")
+        Path,
+        typer.Argument(
+            metavar="SYSTEM.ssp", help="A package, PACKAGE.ssp#VARIANT.ssd, or an .ssd file."
+        ),
     ],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="System file [default: SYSTEM.toml].")
@@ -380,7 +386,7 @@ def import_(
     """Write an SSP as SYSTEM.toml, with its FMUs in a folder SYSTEM_models beside it."""
     from master_node.system_files import import_system  # noqa: PLC0415
 
-    path = output or package.with_suffix(".toml")
+    path = output or package.with_name(f"{package.stem.replace('.ssp#', '_')}.toml")
     for note in import_system(package, path):
         log.warning("%s", note)
     typer.echo(path)

@@ -63,8 +63,8 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
         if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:
             raise ConfigurationError(
                 f"{part.name}: the model cannot handle variable communication step sizes",
-                remedy=f"give [slaves.{part.name}] step_size, or use --estimator none with a fixed "
-                "--step-size",
+                remedy=f"give {system.places.setting(f'slaves.{part.name}', 'step_size')}, or use "
+                "--estimator none with a fixed --step-size",
             )
         highest, wanted = part.max_order, settings.order
         if part.connected and (highest < (1 if wanted == "auto" else wanted)):

@@ -34,6 +34,7 @@ from pydantic_core import ErrorDetails
 
 from master_node.numerics.dense_output import OutputGrid
 from master_node.numerics.extrapolation import InputPolynomial
+from master_node.places import SspPlaces, SystemFilePlaces
 from master_node.toml_files import read_located_tables
 from protocol.agents import check_label, is_sha256
 from protocol.errors import ConfigurationError
@@ -291,7 +292,7 @@ class SimulationSettings(_Table):
         """
         if self.stop_time is None:
             raise ConfigurationError(
-                "[simulation] stop_time is missing", remedy="give it in the file or --stop-time"
+                "[simulation] stop_time is missing", remedy="give it there, or say --stop-time"
             )
         return float(self.stop_time)
 
@@ -634,6 +635,7 @@ class System(_Table):
             the time, and tuples of times and values.
         base: directory to which the models' paths are relative; default: the working directory.
         source: what to call this in messages: the file's name.
+        places: what to call its parts there.
 
     Raises:
         ConfigurationError: a table is wrong; the message has a line for each mistake.
@@ -647,12 +649,14 @@ class System(_Table):
     bus: BusSettings = BusSettings()
     base: Path = Field(default_factory=Path.cwd, exclude=True)
     source: str = Field(default="the system", exclude=True)
+    places: SystemFilePlaces | SspPlaces = Field(SystemFilePlaces("the system"), exclude=True)
 
     def __init__(self, **tables: Any) -> None:
+        source = str(tables.get("source", "the system"))
+        tables.setdefault("places", SystemFilePlaces(source))
         try:
             super().__init__(**tables)
         except ValidationError as error:
-            source = str(tables.get("source", "the system"))
             raise configuration_error(source, error, _known_keys) from None
 
     @model_validator(mode="after")
@@ -677,10 +681,10 @@ class System(_Table):
         Raises:
             ConfigurationError: something is still missing.
         """
-        try:
-            _ = self.simulation.end
-        except ConfigurationError as error:
-            raise ConfigurationError(f"{self.source}: {error.cause}", remedy=error.remedy) from None
+        if self.simulation.stop_time is None:
+            raise ConfigurationError(
+                self.places.no_stop_time, remedy="give it there, or say --stop-time"
+            )
         return self
 
     def with_simulation(self, **settings: Any) -> System:
@@ -751,6 +755,7 @@ class System(_Table):
             **tables,
             base=self.base,
             source=self.source,
+            places=self.places,
         )
 
 
@@ -851,4 +856,4 @@ def _known_keys(place: list[str]) -> list[str]:
             return [field.alias or name for name, field in Connection.model_fields.items()]
         case ["inputs", _]:
             model = InputSettings
-    return [name for name in model.model_fields if name not in ("base", "source")]
+    return [name for name in model.model_fields if name not in ("base", "source", "places")]

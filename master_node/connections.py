@@ -126,9 +126,9 @@ def resolve_connections(system: System, finder: VariableFinder) -> list[ScalarCo
     """
     resolved: list[ScalarConnection] = []
     driven: dict[tuple[str, str], str] = {}
-    for number, connection in enumerate(system.connections, start=1):
-        where = f"{system.source}: [[connections]] number {number}"
-        for source, target in _elements(where, connection, finder):
+    for number, connection in enumerate(system.connections):
+        where = system.places.connection(number)
+        for source, target in _elements(where, system.places.ends, connection, finder):
             before = driven.get(target.key)
             if before is not None:
                 raise ConfigurationError(
@@ -145,7 +145,7 @@ def _connection(
 ) -> ScalarConnection:
     types = source.variable.type, target.variable.type
     if connection.mapping is not None:
-        mapped = mapped_cast(*types, connection.mapping)
+        mapped = mapped_cast(source.variable, target.variable, connection.mapping)
         if mapped is None:
             raise ConfigurationError(
                 f"{where}: mapping: {source.reference} is of type {types[0]}, {target.reference} "
@@ -154,7 +154,7 @@ def _connection(
                 "the input can have",
             )
         return ScalarConnection(source, target, IDENTITY, mapped)
-    how = cast(*types)
+    how = cast(source.variable, target.variable)
     if how is None:
         raise ConfigurationError(
             f"{where}: {source.reference} is of type {types[0]}, {target.reference} of type "
@@ -201,13 +201,15 @@ def _transformation(
         return IDENTITY
 
 
-def _elements(where: str, connection: Connection, finder: VariableFinder) -> list[tuple[End, End]]:
-    """The scalar variables of both ends, one to one."""
-    sources = finder.find(where, "from", connection.source)
-    targets = finder.find(where, "to", connection.target)
+def _elements(
+    where: str, words: tuple[str, str], connection: Connection, finder: VariableFinder
+) -> list[tuple[End, End]]:
+    """The scalar variables of both ends, one to one; ``words``: what to call the ends."""
+    sources = finder.find(where, words[0], connection.source)
+    targets = finder.find(where, words[1], connection.target)
     for key, reference, ends, wanted in (
-        ("from", connection.source, sources, Causality.OUTPUT),
-        ("to", connection.target, targets, Causality.INPUT),
+        (words[0], connection.source, sources, Causality.OUTPUT),
+        (words[1], connection.target, targets, Causality.INPUT),
     ):
         _check_causality(where, f"{key} = {reference!r}", ends[0], wanted, finder)
     shapes = [_indices(ends) for ends in (sources, targets)]

@@ -13,7 +13,7 @@ from functools import cached_property
 from master_node.connections import ScalarConnection
 from master_node.discrete_inputs import DrivenInput
 from master_node.external_inputs import Jump
-from master_node.type_casts import Cast
+from master_node.type_casts import Cast, ItemCast
 from master_node.units import Transformation
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
@@ -60,20 +60,29 @@ class HeldInput:
             try:
                 value = self.cast(d[self.output])
             except KeyError:
-                raise SlaveError(
-                    f"the mapping of input {self.name!r} has no entry for the value "
-                    f"{d[self.output]!r:.60}, and the types allow no other way",
-                    slave=self.slave,
-                    phase="set_discrete_inputs",
-                    time=time,
-                    remedy="add the value to the mapping of the connection",
-                ) from None
+                raise self._no_entry(d[self.output], time) from None
         else:
             value = float(y[self.continuous_output])
         if self.transformation.is_identity:
             return value
         assert isinstance(value, float)
         return self.transformation.factor * value + self.transformation.offset
+
+    def _no_entry(self, value: StartValue, time: float) -> SlaveError:
+        if isinstance(self.cast, ItemCast):
+            cause = (
+                f"input {self.name!r} is an Enumeration, and no item of it has the number {value!r}"
+            )
+            remedy = "give the connection a mapping that says which item is meant"
+        else:
+            cause = (
+                f"the mapping of input {self.name!r} has no entry for the value {value!r:.60}, and "
+                "the types allow no other way"
+            )
+            remedy = "add the value to the mapping of the connection"
+        return SlaveError(
+            cause, slave=self.slave, phase="set_discrete_inputs", time=time, remedy=remedy
+        )
 
 
 @dataclass(frozen=True)

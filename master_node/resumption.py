@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from master_node.configuration import InputSettings, System
-from master_node.system_files import open_system
+from master_node.system_files import is_package, open_system
 from protocol.errors import ConfigurationError, ResultsError
 from protocol.files import file_sha256
 from protocol.slave import SlaveDescription
@@ -38,7 +38,7 @@ def saved_system(
     """What was run, as plain data for JSON."""
     tables = system.model_dump(mode="json", by_alias=True, exclude_unset=True, exclude_none=True)
     return {
-        "tables": {k: v for k, v in tables.items() if k not in ("base", "source")},
+        "tables": {k: v for k, v in tables.items() if k not in ("base", "source", "places")},
         "base": str(system.base),
         "source": system.source,
         "path": str(Path(system.source).absolute()),
@@ -59,11 +59,11 @@ def reopened(saved: Mapping[str, Any]) -> Iterator[tuple[System, RunMode]]:
     try:
         path, base = Path(saved["path"]), Path(saved["base"])
         mode = RunMode(**saved["mode"])
-        if path.suffix.lower() != ".ssp":
+        if not is_package(path):
             yield _system(saved, base), mode
             return
         with open_system(path) as opened:
-            yield _system(saved, opened.base), mode
+            yield _system(saved, opened.base, places=opened.places), mode
     except (KeyError, TypeError) as error:
         raise ResultsError(f"the checkpoint is malformed: {error!r}") from error
 
@@ -84,8 +84,8 @@ def check_models(saved: Mapping[str, Any], descriptions: Mapping[str, SlaveDescr
             )
 
 
-def _system(saved: Mapping[str, Any], base: Path) -> System:
-    system = System(**saved["tables"], base=base, source=saved["source"])
+def _system(saved: Mapping[str, Any], base: Path, **places: Any) -> System:
+    system = System(**saved["tables"], base=base, source=saved["source"], **places)
     for path, hash_ in saved["files"].items():
         if _sha256(base / path) != hash_:
             raise ConfigurationError(

@@ -89,7 +89,7 @@ def slaves_in_process(system: System) -> Iterator[Slaves]:
         for name, settings in system.slaves.items():
             if settings.model is None:
                 raise ConfigurationError(
-                    f"{system.source}: [slaves.{name}] has no model, so it cannot run in process"
+                    f"{system.places.slave(name)} has no model, so it cannot run in process"
                 )
             scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="doublestep-"))
             try:

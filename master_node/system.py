@@ -7,7 +7,7 @@ that are held in each step (``discrete_coupling.py``).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
@@ -332,17 +332,16 @@ def _parts(
 def _check_slave_tables(system: System, finder: VariableFinder) -> None:
     for slave, settings in system.slaves.items():
         outputs = [v.name for v in finder.descriptions[slave].of(Causality.OUTPUT)]
-        tables: list[tuple[str, Mapping[str, object], Sequence[str]]] = [
-            ("parameters", settings.parameters, finder.names(slave)),
-            ("tolerances", settings.tolerances, outputs),
+        tables: list[tuple[Callable[[str, str], str], Mapping[str, object], Sequence[str]]] = [
+            (system.places.parameter, settings.parameters, finder.names(slave)),
+            (system.places.tolerance, settings.tolerances, outputs),
         ]
-        for table, given, known in tables:
+        for place, given, known in tables:
             names = frozenset(known)
             for name in given:
                 if name not in names:
                     raise ConfigurationError(
-                        f"{system.source}: [slaves.{slave}.{table}] {name!r}: "
-                        f"no such variable{nearest(name, known)}"
+                        f"{place(slave, name)}: no such variable{nearest(name, known)}"
                     )
 
 

@@ -20,11 +20,13 @@ from typing import Any
 import tomli_w
 
 from master_node.configuration import System, load_system
-from master_node.ssp.flattening import Slave, flatten
+from master_node.places import SspPlaces
+from master_node.ssp.flattening import FlatConnection, Slave, flatten
 from master_node.ssp.reading import read_structure
 from master_node.ssp.structure import Notes, Structure, listed
 from master_node.ssp.writing import write_package
-from protocol.errors import ConfigurationError
+from protocol.errors import ConfigurationError, DoublestepError
+from protocol.files import as_file, is_fmu
 from protocol.keys import check_name
 from protocol.slave import SlaveDescription
 from protocol.toml_text import parse_toml
@@ -51,39 +53,65 @@ class ImportedSystem:
 def open_system(path: Path | str) -> Iterator[System]:
     """The system in a ``.toml``, ``.ssp`` or ``.ssd`` file.
 
-    The models of a package are extracted into a temporary directory, which is removed at the end:
-    run the system within the ``with``. What an SSP file holds that is not carried is logged.
+    ``package.ssp#Variant.ssd`` is another description of a package than its
+    ``SystemStructure.ssd``. The models of a package are extracted into a temporary directory,
+    which is removed at the end: run the system within the ``with``. What an SSP file holds that is
+    not carried is logged.
 
     Raises:
         ConfigurationError: the file is missing or wrong, or holds what is not supported.
     """
     path = Path(path)
-    if path.suffix.lower() not in _SSP_SUFFIXES:
+    if not is_ssp(path):
         yield load_system(path)
         return
     with tempfile.TemporaryDirectory(prefix="doublestep-") as scratch:
         imported = read_ssp(path, Path(scratch))
         for note in imported.notes:
             log.warning("%s", note)
-        yield imported.system
+        try:
+            yield imported.system
+        except DoublestepError as error:
+            package, _ = _package(path)
+            error.cause = error.cause.replace(f"{scratch}{os.sep}", f"{package}{os.sep}")
+            raise
+
+
+def is_ssp(path: Path) -> bool:
+    """Whether the name of a system means a package, a variant in one, or a description."""
+    return path.suffix.lower() in _SSP_SUFFIXES
+
+
+def is_package(path: Path) -> bool:
+    """Whether the name of a system means a package, or a variant in one."""
+    return _package(path)[0].suffix.lower() == ".ssp"
+
+
+def _package(path: Path) -> tuple[Path, str]:
+    """The file that a name means, and the variant in it; "" where none is said."""
+    name, mark, variant = path.name.rpartition("#")
+    if mark and name.lower().endswith(".ssp") and not path.exists():
+        return path.with_name(name), variant
+    return path, ""
 
 
 def read_ssp(path: Path, scratch: Path) -> ImportedSystem:
     """The system in an ``.ssp`` or ``.ssd`` file.
 
     Args:
-        path: the file.
+        path: the file, or ``package.ssp#Variant.ssd``.
         scratch: an existing empty directory, into which packages are extracted.
 
     Raises:
         ConfigurationError: as `open_system`.
     """
     notes = Notes(str(path))
-    structure = read_structure(path, scratch, notes)
+    file, variant = _package(path)
+    structure = read_structure(file, scratch, notes, variant)
     load = entry_points(group="doublestep.in_process")["describe"].load()
     describe: Callable[[Path], SlaveDescription] = cache(lambda fmu: load(str(fmu), Path()))
     slaves, connections = flatten(structure.system, describe, notes)
-    base = scratch if path.suffix.lower() == ".ssp" else path.absolute().parent
+    base = scratch if is_package(path) else path.absolute().parent
     tables = _settings(structure, path, notes)
     unknown = sorted(tables["slaves"].keys() - {slave.name for slave in slaves})
     if unknown:
@@ -93,16 +121,17 @@ def read_ssp(path: Path, scratch: Path) -> ImportedSystem:
         **more,
         simulation=tables["simulation"],
         slaves={slave.name: _slave(slave, base, tables["slaves"], path) for slave in slaves},
-        connections=tuple(connections),
+        connections=tuple(connection.table for connection in connections),
         bus=tables["bus"],
         base=base,
         source=str(path),
+        places=_places(path, slaves, connections),
     )
     return ImportedSystem(system, notes.sentences())
 
 
 def import_system(path: Path, output: Path) -> tuple[str, ...]:
-    """Write an ``.ssp`` or ``.ssd`` file as a TOML file.
+    """Write an ``.ssp`` or ``.ssd`` file, or a variant of a package, as a TOML file.
 
     FMUs out of packages are copied to a folder beside it, named after it with ``_models``; what
     is there of these names is overwritten.
@@ -126,7 +155,8 @@ def import_system(path: Path, output: Path) -> tuple[str, ...]:
                 model = system.base / str(system.slaves[name].model)
                 if model.is_relative_to(scratch):
                     folder.mkdir(parents=True, exist_ok=True)
-                    shutil.copyfile(model, folder / names[name])
+                    with as_file(model) as file:
+                        shutil.copyfile(file, folder / names[name])
                     model = folder / names[name]
                 relative = os.path.relpath(model, output.parent)
                 tables["slaves"][name]["model"] = Path(relative).as_posix()
@@ -146,9 +176,9 @@ def export_system(path: Path, output: Path) -> None:
     describe = entry_points(group="doublestep.in_process")["describe"].load()
     with open_system(path) as system:
         for name, settings in system.slaves.items():
-            if settings.model is None or not settings.model.lower().endswith(".fmu"):
+            if settings.model is None or not is_fmu(settings.model, system.base):
                 raise ConfigurationError(
-                    f"{system.source}: [slaves.{name}] has no FMU"
+                    f"{system.places.slave(name)} has no FMU"
                     + (f" but {settings.model!r}" if settings.model else ""),
                     remedy="only FMUs can be put into an SSP: export the model as one",
                 )
@@ -157,6 +187,19 @@ def export_system(path: Path, output: Path) -> None:
             _replace(output, lambda file: write_package(system, names, describe, output.stem, file))
         except OSError as error:
             raise ConfigurationError(f"{output}: cannot be written: {error}") from error
+
+
+def _places(path: Path, slaves: list[Slave], connections: list[FlatConnection]) -> SspPlaces:
+    return SspPlaces(
+        str(path),
+        {slave.name: slave.place for slave in slaves},
+        {
+            (slave.name, name): place
+            for slave in slaves
+            for name, place in slave.parameter_places.items()
+        },
+        tuple(connection.place for connection in connections),
+    )
 
 
 def _settings(structure: Structure, path: Path, notes: Notes) -> dict[str, dict[str, Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from protocol.slave import StartValue, VariableType
+from protocol.slave import StartValue, Variable, VariableType
 
 Cast = Callable[[StartValue], StartValue]
 
@@ -17,24 +17,46 @@ _EXACT_INTEGERS = {
 """Up to here a floating-point type holds every integer."""
 
 
-def cast(source: VariableType, target: VariableType) -> Cast | None:
-    """How a value of type ``source`` becomes one of type ``target``.
+def cast(source: Variable, target: Variable) -> Cast | None:
+    """How a value of ``source`` becomes one of ``target``.
+
+    An integer becomes an enumeration's item that has its number.
 
     Returns:
         None if a value could be lost or changed on the way.
     """
-    if source is VariableType.CLOCK or target is VariableType.CLOCK:
+    if source.type is VariableType.CLOCK or target.type is VariableType.CLOCK:
         return None
-    if source is target:
+    if target.items and source.type.integer_range is not None:
+        return _to_items(source, target)
+    if source.type is target.type:
         return _same
-    if source.is_real:
-        narrows = target is VariableType.FLOAT32
-        return _same if target.is_real and not narrows else None
-    if source is VariableType.BOOLEAN:
-        return _from_boolean(target)
-    if source.integer_range is not None:
-        return _from_integer(source.integer_range, target)
-    return None
+    if source.type.is_real:
+        narrows = target.type is VariableType.FLOAT32
+        return _same if target.type.is_real and not narrows else None
+    if source.type is VariableType.BOOLEAN:
+        return _from_boolean(target.type)
+    values = source.type.integer_range
+    if source.items:
+        values = min(source.items.values()), max(source.items.values())
+    return None if values is None else _from_integer(values, target.type)
+
+
+@dataclass(frozen=True, slots=True)
+class ItemCast:
+    """From integers to the items of an enumeration; KeyError for a number that no item has.
+
+    Attributes:
+        items: their numbers.
+    """
+
+    items: frozenset[int]
+
+    def __call__(self, value: StartValue) -> StartValue:
+        """The number itself."""
+        if value not in self.items:
+            raise KeyError(value)
+        return value
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,32 +82,39 @@ class MappedCast:
 
 
 def mapped_cast(
-    source: VariableType,
-    target: VariableType,
+    source: Variable,
+    target: Variable,
     entries: Mapping[bool, bool] | Mapping[int, int],
 ) -> MappedCast | None:
     """How values of one type become some of another by a mapping.
 
     Args:
-        source: type of the output.
-        target: type of the input.
+        source: the output.
+        target: the input.
         entries: booleans to booleans, or integers to integers.
 
     Returns:
         None if the types are not those of the entries: both Boolean, or both integers or
-        enumerations; or if an entry does not fit the type ``target``.
+        enumerations; or if an entry does not fit ``target``.
     """
-    types = (source, target)
+    types = (source.type, target.type)
     if all(isinstance(value, bool) for pair in entries.items() for value in pair):
         fits = types == (VariableType.BOOLEAN, VariableType.BOOLEAN)
     else:
-        bounds = target.integer_range
+        bounds, items = target.type.integer_range, target.items.values()
         fits = (
-            source.integer_range is not None
+            source.type.integer_range is not None
             and bounds is not None
             and all(bounds[0] <= value <= bounds[1] for value in entries.values())
+            and (not items or set(entries.values()).issubset(items))
         )
     return MappedCast(entries, cast(source, target)) if fits else None
+
+
+def _to_items(source: Variable, target: Variable) -> Cast:
+    items = frozenset(target.items.values())
+    fits = source.items and items.issuperset(source.items.values())
+    return _same if fits else ItemCast(items)
 
 
 def _from_boolean(target: VariableType) -> Cast | None:
@@ -97,7 +126,7 @@ def _from_boolean(target: VariableType) -> Cast | None:
 
 
 def _from_integer(values: tuple[int, int], target: VariableType) -> Cast | None:
-    """From an integer type with a range; no integer can be relied on to be an enumeration's."""
+    """From integers in a range; of an enumeration without known items none is known to be one."""
     smallest, largest = values
     if target.is_real:
         bound = _EXACT_INTEGERS[target]

@@ -114,9 +114,9 @@ class AgentModel:
     """A model that an agent can load.
 
     Attributes:
-        name: of its file, without folders; empty for one that was uploaded.
-        sha256: of its file.
-        size: of its file [bytes].
+        name: of its file or folder, without the folders above; empty for one that was uploaded.
+        sha256: of its file, or of the archive that its folder is packed into.
+        size: of the same [bytes].
     """
 
     name: str

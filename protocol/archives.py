@@ -3,6 +3,9 @@
 An archive is untrusted input: entry names must stay inside, there must be no links, and what it
 unpacks to is bounded, whatever it says of itself. XML must declare no document type, and is
 bounded in bytes, elements and depth: a parser makes a hundred bytes of each byte of a bomb.
+
+Tools write one name in several ways, with ``./`` in front, with double slashes or backslashes.
+Entries are known by their plain names, with single slashes.
 """
 
 from __future__ import annotations
@@ -49,6 +52,8 @@ UNREADABLE = (
 def checked_archive(path: Path, kind: str) -> Iterator[zipfile.ZipFile]:
     """The archive, open for reading, after all its entries were checked.
 
+    Its entries have plain names; one for the root folder itself is left out.
+
     Args:
         path: of the archive.
         kind: what it should be, for messages, such as ``FMU``.
@@ -62,6 +67,7 @@ def checked_archive(path: Path, kind: str) -> Iterator[zipfile.ZipFile]:
     try:
         with bounded_archive(path) as archive:
             _check_entries(path, archive.infolist())
+            _name_plainly(archive)
             yield archive
     except UNREADABLE as error:
         raise ModelError(
@@ -188,15 +194,17 @@ def _check_entries(path: Path, entries: Sequence[zipfile.ZipInfo]) -> None:
     if len(entries) > MAX_ENTRIES:
         raise ModelError(f"{path}: {len(entries)} entries; the limit is {MAX_ENTRIES}")
     total = 0
-    seen = set()
+    seen: dict[tuple[str, ...], bool] = {}
     for entry in entries:
         name = entry.filename
-        parts = PurePosixPath(name.replace("\\", "/")).parts
-        if not parts or name.startswith(("/", "\\")) or ".." in parts or ":" in parts[0]:
+        parts, is_folder = _parts(name), _is_folder(name)
+        leads_outside = name.startswith(("/", "\\")) or ".." in parts or ":" in "".join(parts[:1])
+        if leads_outside or not (parts or is_folder):
             raise ModelError(f"{path}: entry {name!r:.200} leads outside the archive")
-        if parts in seen:  # the one that was checked need not be the one that is extracted
+        if parts in seen and not (is_folder and seen[parts]):
+            # the file that was checked need not be the one that is extracted
             raise ModelError(f"{path}: entry {name!r:.200} is there twice")
-        seen.add(parts)
+        seen[parts] = is_folder
         if stat.S_ISLNK(entry.external_attr >> 16):
             raise ModelError(f"{path}: entry {name!r:.200} is a symbolic link")
         if entry.compress_type not in _COMPRESSIONS:
@@ -210,3 +218,23 @@ def _check_entries(path: Path, entries: Sequence[zipfile.ZipInfo]) -> None:
             raise ModelError(
                 f"{path}: entry {name!r:.200} unpacks to {entry.file_size} bytes, beyond the limits"
             )
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """Folders and file of an entry; none for the root folder."""
+    return PurePosixPath(name.replace("\\", "/")).parts
+
+
+def _is_folder(name: str) -> bool:
+    return name.endswith(("/", "\\"))
+
+
+def _name_plainly(archive: zipfile.ZipFile) -> None:
+    entries = {}
+    for entry in archive.infolist():
+        parts = _parts(entry.filename)
+        entry.filename = "/".join(parts) + ("/" if _is_folder(entry.filename) else "")
+        if parts:
+            entries[entry.filename] = entry
+    archive.filelist[:] = entries.values()
+    archive.NameToInfo = entries

@@ -683,6 +683,19 @@ def _record(cls: Any, value: Any, checks: Mapping[str, _Check]) -> Any:
     return cls(**{name: check(values[name], name) for name, check in checks.items()})
 
 
+def _bound(value: Any, what: str) -> float | int | None:
+    if value is None or type(value) in (float, int):
+        return value  # type: ignore[no-any-return]
+    raise MalformedMessageError(f"{what} must be a number, not {_shown(value)}")
+
+
+def _items(value: Any, what: str) -> dict[str, int]:
+    items = _mapping(value, what)
+    if all(type(number) is int for number in items.values()):
+        return items
+    raise MalformedMessageError(f"{what} must be a map of names to integers")
+
+
 def _variable(value: Any, _what: str = "") -> Variable:
     return _record(Variable, value, _VARIABLE_FIELDS)  # type: ignore[no-any-return]
 
@@ -727,6 +740,9 @@ _VARIABLE_FIELDS: Mapping[str, _Check] = {
     "start": lambda value, what: None if value is None else _start_value(value, what),
     "nominal": _number,
     "description": _text,
+    "minimum": _bound,
+    "maximum": _bound,
+    "items": _items,
 }
 _CAPABILITY_FIELDS: Mapping[str, _Check] = {
     "can_get_and_set_state": _boolean,

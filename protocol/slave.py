@@ -137,6 +137,8 @@ class Variable:
         unit: unit name as declared, "" if none.
         start: start value, None if the model gives none.
         nominal: nominal value, in ``unit``; scales the absolute tolerance.
+        minimum, maximum: smallest and largest value [``unit``]; None: no bound is declared.
+        items: of an enumeration: the number of each item by its name; empty for other types.
     """
 
     name: str
@@ -147,6 +149,9 @@ class Variable:
     start: StartValue | None = None
     nominal: float = 1.0
     description: str = ""
+    minimum: float | int | None = None
+    maximum: float | int | None = None
+    items: Mapping[str, int] = field(default_factory=dict, hash=False)
 
     @property
     def is_continuous_real(self) -> bool:

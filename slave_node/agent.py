@@ -366,7 +366,7 @@ class Agent:
             path = None if cache is None else cache.path(model)
             if path is not None:
                 return path.parent, path.name
-        elif model.lower().endswith(".fmu") and store.has(model):
+        elif not model.endswith(".py") and store.has(model):
             return store.directory, model
         raise ModelError(
             f"it has no model {model!r:.140}", remedy="copy it into its --models directory"

@@ -48,7 +48,10 @@ log = logging.getLogger("slave_node")
 _MB = 10**6
 
 Model = Annotated[
-    str, typer.Argument(help="An .fmu file, package.module:Class or path/to/file.py:Class.")
+    str,
+    typer.Argument(
+        help="An .fmu file, the folder of an FMU, package.module:Class or path/to/file.py:Class."
+    ),
 ]
 
 Insecure = Annotated[bool, typer.Option("--insecure", help="Allow addresses other than loopback.")]
@@ -121,7 +124,7 @@ def serve(  # noqa: PLR0917  options of the command line
     from slave_node.node import SlaveNode  # noqa: PLC0415
     from slave_node.worker import ModelReference, WorkerProcess  # noqa: PLC0415
 
-    key = SlaveKey(check_name(name or _default_name(model)), instance or token_hex(4))
+    key = SlaveKey(check_name(name or _default_name(model, base)), instance or token_hex(4))
     configure_logs(log_format, f"%(asctime)s {key.name}: %(message)s", slave=key.name)
     endpoints = Endpoints(
         listen=tuple(listen or ()),
@@ -452,8 +455,11 @@ def _make_directory(path: Path) -> None:
         raise ConfigurationError(f"{path} cannot be made: {error}") from error
 
 
-def _default_name(model: str) -> str:
-    return model.rpartition(":")[2] if ":" in model else Path(model).stem
+def _default_name(model: str, base: Path) -> str:
+    if ":" in model:
+        return model.rpartition(":")[2]
+    path = (base / model).resolve()
+    return path.name if path.is_dir() else path.stem
 
 
 def _parameters(assignments: list[str]) -> dict[str, StartValue]:

@@ -9,6 +9,7 @@ from tempfile import mkdtemp
 
 from protocol.calls import Configure
 from protocol.errors import ModelError
+from protocol.files import is_fmu
 from protocol.slave import CallExecutor, Slave, SlaveDescription
 from slave_node.executor import Executor
 from slave_node.model import Model, describe
@@ -31,8 +32,8 @@ def load_slave(
     """The slave for ``model``, whose state is saved as the configuration says or as is best.
 
     Args:
-        model: path of an ``.fmu`` file, or ``package.module:Class`` or ``file.py:Class``; paths
-            are relative to ``base``.
+        model: path of an ``.fmu`` file or of an FMU's folder, or ``package.module:Class`` or
+            ``file.py:Class``; paths are relative to ``base``.
         base: directory of the system file, or the working directory.
         name: instance name.
         scratch: an existing empty directory to extract into; the caller removes it after close.
@@ -70,7 +71,7 @@ def load_model(
 
     Arguments and errors as for `load_slave`, but ``configuration`` names no state kind.
     """
-    if _is_fmu(model):
+    if is_fmu(model, base):
         from slave_node.fmu.loading import load_fmu  # noqa: PLC0415  a Python model needs no fmpy
 
         slave: Slave = load_fmu(
@@ -104,7 +105,7 @@ def describe_model(model: str, base: Path) -> SlaveDescription:
 
 def _describe_alone(model: str, base: Path) -> SlaveDescription:
     """The model as it says itself."""
-    if _is_fmu(model):
+    if is_fmu(model, base):
         from slave_node.fmu.description import describe_fmu  # noqa: PLC0415  as above
 
         description = describe_fmu((base / model).resolve())
@@ -113,15 +114,11 @@ def _describe_alone(model: str, base: Path) -> SlaveDescription:
     return replace(description, input_derivatives=input_derivatives(description))
 
 
-def _is_fmu(model: str) -> bool:
-    return model.lower().endswith(".fmu")
-
-
 def _model_class(model: str, base: Path) -> type[Model]:
     if ":" not in model:
         raise ModelError(
             f"{model!r} is not a model",
-            remedy="name an .fmu file, package.module:Class or file.py:Class",
+            remedy="name an .fmu file, the folder of an FMU, package.module:Class or file.py:Class",
         )
     return load_model_class(model, base)
 

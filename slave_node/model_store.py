@@ -14,7 +14,7 @@ from pathlib import Path
 
 from protocol.agents import AgentModel
 from protocol.errors import ConfigurationError
-from protocol.files import file_sha256
+from protocol.files import DESCRIPTION, Contents, entry_names
 
 log = logging.getLogger("slave_node")
 
@@ -23,15 +23,15 @@ _FILE_NAME = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.-]{0,127}")
 
 @dataclass(frozen=True, slots=True)
 class _Hashed:
-    size: int
     changed: int
-    sha256: str
+    contents: Contents
 
 
 class ModelStore:
-    """FMUs in a directory, without its subdirectories; and Python files, if they are wanted.
+    """FMUs in a directory, files and folders; and Python files, if they are wanted.
 
-    Files may come, go and change at any time.
+    A folder is one if it is an unpacked FMU; others are not looked into. Files may come, go and
+    change at any time.
 
     Args:
         directory: existing.
@@ -67,7 +67,7 @@ class ModelStore:
                 except OSError as error:
                     log.warning("%s cannot be read: %s", path, error)
                     continue
-                found.append(AgentModel(path.name, entry.sha256, entry.size))
+                found.append(AgentModel(path.name, *entry.contents))
             self._hashed = hashed
             return tuple(found)
 
@@ -90,7 +90,8 @@ class ModelStore:
             paths = sorted(
                 path
                 for path in self.directory.iterdir()
-                if path.suffix.lower() in self._suffixes and path.is_file()
+                if (path.suffix.lower() in self._suffixes and path.is_file())
+                or (path / DESCRIPTION).is_file()
             )
         except OSError as error:
             raise ConfigurationError(f"{self.directory} cannot be read: {error}") from error
@@ -102,8 +103,10 @@ class ModelStore:
         return named
 
     def _entry(self, path: Path) -> _Hashed:
-        status = path.stat()
+        files = sorted(map(path.joinpath, entry_names(path))) if path.is_dir() else [path]
+        statuses = [file.stat() for file in files]
+        changed = hash((*files, *((status.st_size, status.st_mtime_ns) for status in statuses)))
         known = self._hashed.get(path)
-        if known and (known.size, known.changed) == (status.st_size, status.st_mtime_ns):
+        if known and known.changed == changed:
             return known
-        return _Hashed(status.st_size, status.st_mtime_ns, file_sha256(path))
+        return _Hashed(changed, Contents.of(path))

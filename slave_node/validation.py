@@ -37,6 +37,7 @@ from protocol.errors import (
     SlaveError,
     StepRejectedError,
 )
+from protocol.files import is_fmu
 from protocol.signals import MAX_ORDER, FloatArray
 from protocol.slave import (
     Causality,
@@ -110,7 +111,7 @@ def validate(
     Raises:
         ModelError: the model is missing or cannot be read.
     """
-    if model.lower().endswith(".fmu"):
+    if is_fmu(model, base):
         yield _description((base / model).resolve())
     trial = _Trial(worker(ModelReference(model, base, "validated")), timeout)
     try:

@@ -350,6 +350,28 @@ def test_a_model_is_sent_once_and_only_with_permission(
     assert results[0] == results[1]
 
 
+def test_the_folder_of_an_fmu_is_sent_packed(
+    start_agent: StartAgent, tmp_path: Path, fmu_dir: Path, endpoint: str, reference: bytes
+) -> None:
+    """An agent that has the folder loads its own, another one is sent the archive: equal bits."""
+    with zipfile.ZipFile(fmu_dir / "wheel.fmu") as archive:
+        archive.extractall(tmp_path / "here" / "wheel")
+        archive.extractall(tmp_path / "there" / "wheel")
+    start_agent("has", "--connect", endpoint, directory=tmp_path / "there")
+    start_agent("takes", "--connect", endpoint, "--allow-upload")
+    sent: list[Sent] = []
+    for host in ("has", "takes"):
+        file = system_file(
+            tmp_path,
+            {"model": fmu_dir / "chassis.fmu"},
+            {"model": "here/wheel/", "host": host},
+            bus=listening(endpoint),
+        )
+        run_system(load_system(file), tmp_path / host, uploading=sent.append)
+        assert (tmp_path / host / "results.csv").read_bytes() == reference
+    assert [(one.agent, one.model) for one in sent] == [("takes", "wheel")]
+
+
 def pieces(data: bytes, sha256: str | None = None) -> list[Upload]:
     """All of a file."""
     sha256 = sha256 or hashlib.sha256(data).hexdigest()

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from master_node.ssp.graph import INWARD, Edge, Port, SignalGraph, numbered, shape
 from master_node.ssp.graph import Path as ElementPath
@@ -40,6 +41,13 @@ Describe = Callable[[Path], SlaveDescription]
 
 _MOST_DIMENSIONS = 2
 """Of an array whose rows a system file can hold; more are given element by element."""
+
+
+class Given(NamedTuple):
+    """A start value, and the file and line that it comes from."""
+
+    value: Value
+    place: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +102,7 @@ class ParameterBinder:
         notes: for what is not carried.
 
     Attributes:
-        parameters: start values by variable, by path of the component.
+        parameters: start values by variable, by path of the component, with their places.
         given: ports of systems and signal dictionaries that got a value.
     """
 
@@ -109,7 +117,7 @@ class ParameterBinder:
         self._names = names
         self._model = cache(lambda fmu: _Model(describe(fmu)))
         self._notes = notes
-        self.parameters: dict[ElementPath, dict[str, Value]] = {p: {} for p in graph.components}
+        self.parameters: dict[ElementPath, dict[str, Given]] = {p: {} for p in graph.components}
         self.given: set[Port] = set()
 
     def bind(self) -> None:
@@ -161,14 +169,15 @@ class ParameterBinder:
             else Unit(variable.unit, defined.exponents, defined.factor, defined.offset),
             connector.items if connector is not None else {},
         )
-        parameter = _numbered(self._arrived(parameter, target), parameter.items)
+        items = {**parameter.items, **variable.items}
+        parameter = _numbered(self._arrived(parameter, target), items)
         value = _checked(parameter, variable, target.shown, is_array=is_array)
         whole = len(_sizes(value)) <= _MOST_DIMENSIONS
         given = {name: value} if whole else dict(_elements(name, (), value))
         parameters = self.parameters[path]
         for key in given.keys() & parameters.keys():
             del parameters[key]  # of an array and its elements what comes later wins
-        parameters.update(given)
+        parameters.update({key: Given(one, parameter.place) for key, one in given.items()})
         return True
 
     def _give_connector(

@@ -57,7 +57,7 @@ def read_connector(node: Node, kind: str, definitions: Definitions) -> Connector
     """A connector, or an entry of a signal dictionary.
 
     Raises:
-        ConfigurationError: it has several types, an unknown unit, or wrong dimensions.
+        ConfigurationError: it has several types, or wrong dimensions.
     """
     unit, items, mime_type, problem = None, {}, "", ""
     types = node.children(*_TYPES)
@@ -67,7 +67,7 @@ def read_connector(node: Node, kind: str, definitions: Definitions) -> Connector
         name = child.attribute("unit")
         if name and name not in definitions.units:
             near = nearest(name, definitions.units)
-            raise child.error(f"unit {name!r} is not in the Units of the file{near}")
+            child.tell(f"unit {name!r} is not in the Units of the file{near}; it counts as none")
         unit = definitions.units.get(name)
         items = dict(definitions.enumerations.get(child.attribute("name"), {}))
         mime_type = child.attribute("mime-type")

@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from master_node.ssp.binding import Describe, ParameterBinder
 from master_node.ssp.graph import OPEN, Edge, Port, SignalGraph, numbered
@@ -38,29 +38,51 @@ class Slave:
 
     Attributes:
         name: of the slave.
-        model: the FMU file.
+        model: the FMU.
         parameters: start values by variable.
+        place: file and line of the component.
+        parameter_places: file and line of each start value.
     """
 
     name: str
     model: Path
     parameters: Mapping[str, Value]
+    place: str
+    parameter_places: Mapping[str, str]
+
+
+class FlatConnection(NamedTuple):
+    """A connection between slaves.
+
+    Attributes:
+        table: of the system file.
+        place: file and line of the element that leads to the input.
+    """
+
+    table: dict[str, Any]
+    place: str
 
 
 def flatten(
     system: SystemElement, describe: Describe, notes: Notes
-) -> tuple[list[Slave], list[dict[str, Any]]]:
-    """The slaves of a system and the tables of its connections, in the order of the document.
+) -> tuple[list[Slave], list[FlatConnection]]:
+    """The slaves of a system and the connections between them, in the order of the document.
 
     Args:
         system: the root system.
-        describe: gives the description of an FMU file; asked only where parameters are bound.
+        describe: gives the description of an FMU; asked only where parameters are bound.
         notes: for what is not carried.
 
     Raises:
         ConfigurationError: a connection or a parameter cannot be carried, with file and line.
     """
     graph = SignalGraph(system)
+    if not graph.components:
+        raise ConfigurationError(
+            f"{system.place}: ssd:System {system.name!r} has no ssd:Component, so there is nothing "
+            "to simulate",
+            remedy="add the components, or choose another variant of the package",
+        )
     names = _slave_names(graph.components, notes)
     flattening = _Flattening(graph, names, notes)
     connections = flattening.connections()
@@ -68,7 +90,13 @@ def flatten(
     binder.bind()
     flattening.tell_not_driven(binder.given)
     slaves = [
-        Slave(names[path], component.model, binder.parameters[path])
+        Slave(
+            names[path],
+            component.model,
+            {name: given.value for name, given in binder.parameters[path].items()},
+            component.place,
+            {name: given.place for name, given in binder.parameters[path].items()},
+        )
         for path, component in graph.components.items()
     ]
     return slaves, connections
@@ -81,9 +109,9 @@ class _Flattening:
         self._notes = notes
         self._not_driven: dict[Port, Edge] = {}
 
-    def connections(self) -> list[dict[str, Any]]:
-        """The tables of all connections between components."""
-        tables = []
+    def connections(self) -> list[FlatConnection]:
+        """All connections between components."""
+        found = []
         for edge in self._graph.incoming.values():
             path, name = edge.target
             if path not in self._graph.components:
@@ -104,8 +132,8 @@ class _Flattening:
                 "from": f"{self._names[source[0]]}.{source[1]}",
                 "to": f"{self._names[path]}.{name}",
             }
-            tables.append(table | self._transformation(way))
-        return tables
+            found.append(FlatConnection(table | self._transformation(way), edge.element.place))
+        return found
 
     def tell_not_driven(self, given: set[Port]) -> None:
         """Name connectors and entries that feed inputs and get no signal.

@@ -33,6 +33,7 @@ from master_node.ssp.transformations import read_transformation
 from master_node.ssp.xml_nodes import Node, as_integer, boolean, number, parse
 from protocol.archives import MAX_TOTAL_BYTES, MAX_XML_BYTES, checked_archive
 from protocol.errors import ModelError
+from protocol.files import is_fmu
 from protocol.names import nearest
 
 SETTINGS_ANNOTATION = "org.doublestep.system"
@@ -57,7 +58,7 @@ _KINDS = {
 }
 
 
-def read_structure(path: Path, scratch: Path, notes: Notes) -> Structure:
+def read_structure(path: Path, scratch: Path, notes: Notes, variant: str = "") -> Structure:
     """Read an ``.ssp`` or ``.ssd`` file with all that it refers to.
 
     Args:
@@ -65,6 +66,7 @@ def read_structure(path: Path, scratch: Path, notes: Notes) -> Structure:
         scratch: an existing empty directory. A package is extracted into it, nested packages
             into folders of it; models are there as long as it lives.
         notes: for what is not carried.
+        variant: name of the description in a package; "": ``SystemStructure.ssd``.
 
     Raises:
         ModelError: an archive or a document is missing, cannot be read, or is unsafe.
@@ -73,8 +75,10 @@ def read_structure(path: Path, scratch: Path, notes: Notes) -> Structure:
     reader = _Reader(scratch, notes)
     if path.suffix.lower() == ".ssd":
         return reader.document(_Place(path.absolute().parent, path.name, str(path.parent)))
-    reader.extract(path, scratch)
-    return reader.document(_Place(scratch, DEFAULT_SSD, str(path)))
+    description = reader.extract(path, scratch, variant)
+    structure = reader.document(_Place(scratch, description, str(path)))
+    reader.tell_loose()
+    return structure
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +105,7 @@ class _Place:
     def refer(self, node: Node, uri: str) -> tuple[_Place, str]:
         """The file that a URI means, relative to this one, and the URI's fragment."""
         parts = urlsplit(uri)
-        name = unquote(parts.path)
+        name = unquote(parts.path).replace("\\", "/")
         if parts.scheme or parts.netloc or parts.query:
             raise node.error(
                 f"source {uri!r:.200} is not a relative URI",
@@ -111,7 +115,7 @@ class _Place:
         if (
             name.startswith("/")
             or ".." in PurePosixPath(joined).parts
-            or any(character in name for character in "\\:\0")
+            or any(character in name for character in ":\0")
         ):
             raise node.error(f"source {uri!r:.200} leads outside the folder of the SSD")
         return replace(self, file=joined), unquote(parts.fragment)
@@ -121,26 +125,55 @@ class _Reader:
     def __init__(self, scratch: Path, notes: Notes) -> None:
         self._scratch = scratch
         self._notes = notes
+        self._loose: dict[tuple[Path, str], Path] = {}
+        self._used: set[Path] = set()
         self._packages = 0
         self._elements = 0
         self._room = MAX_TOTAL_BYTES
 
-    def extract(self, package: Path, directory: Path) -> None:
-        """Extract what a system can refer to: descriptions at the root, and resources."""
+    def extract(self, package: Path, directory: Path, variant: str = "") -> str:
+        """Extract what a system can refer to, and give the name of the description to read.
+
+        FMUs belong into ``resources``, and tools put them elsewhere too.
+
+        Args:
+            package: the file.
+            directory: an existing empty one.
+            variant: name of the description; "": the default one.
+        """
         with checked_archive(package, "SSP") as archive:
-            names = archive.namelist()
-            if DEFAULT_SSD not in names:
-                raise ModelError(f"{package}: not an SSP: it holds no {DEFAULT_SSD}")
             for entry in archive.infolist():
-                parts = PurePosixPath(entry.filename).parts
-                is_description = len(parts) == 1 and entry.filename.lower().endswith(".ssd")
-                if is_description or parts[0] == "resources":
-                    self._unpack(package, archive, entry, directory)
-                elif not entry.is_dir() and parts[0] != "documentation":
-                    self._notes.tell(f"{package}: entry {entry.filename!r:.200} is not carried")
-            variants = [n for n in names if "/" not in n and n.lower().endswith(".ssd")]
-        if others := [name for name in variants if name != DEFAULT_SSD]:
-            self._notes.tell(f"{package}: variants beside {DEFAULT_SSD}: {listed(others)}")
+                folder, slash, _ = entry.filename.partition("/")
+                is_description = not slash and entry.filename.lower().endswith(".ssd")
+                if entry.is_dir() or (slash and folder == "documentation"):
+                    continue
+                self._unpack(package, archive, entry, directory)
+                if not is_description and folder != "resources":
+                    self._loose[package, entry.filename] = directory / entry.filename
+            names = archive.namelist()
+        variants = [n for n in names if "/" not in n and n.lower().endswith(".ssd")]
+        wanted = variant or DEFAULT_SSD
+        others = [name for name in variants if name != wanted]
+        choice = f"{listed(others)}; choose one as {package.name}#{others[0]}" if others else ""
+        if wanted not in variants:
+            what = (
+                f"{package} holds no {wanted!r:.200}"
+                if variant
+                else (f"{package}: not an SSP: it holds no {DEFAULT_SSD}")
+            )
+            raise ModelError(f"{what}, but {choice}" if choice else what)
+        if others:
+            self._notes.tell(f"{package}: variants beside {wanted}: {choice}")
+        return wanted
+
+    def tell_loose(self) -> None:
+        """Name what lies outside of ``resources`` and is not part of the system."""
+        loose: dict[Path, list[str]] = {}
+        for (package, name), path in self._loose.items():
+            if not any(path == used or used in path.parents for used in self._used):
+                loose.setdefault(package, []).append(name)
+        for package, names in loose.items():
+            self._notes.tell(f"{package}: entries that are not carried: {listed(names)}")
 
     def document(self, place: _Place, depth: int = 0) -> Structure:
         """A system structure description."""
@@ -159,6 +192,10 @@ class _Reader:
                 start_time = number(experiment, "startTime")
             if experiment.has("stopTime"):
                 stop_time = number(experiment, "stopTime")
+            if stop_time is not None and not (start_time or 0.0) < stop_time:
+                raise experiment.error(
+                    f"stopTime {stop_time!r} is not after startTime {start_time or 0.0!r}"
+                )
             experiment.done()
         read = _Document(self, place, root, definitions).system(system, depth)
         root.done()
@@ -180,11 +217,14 @@ class _Reader:
         if fragment and ("/" in fragment or not fragment.lower().endswith(".ssd")):
             raise node.error(f"{fragment!r:.200} does not name an SSD of the package")
         directory = self._directory(node)
-        self.extract(place.path, directory)
-        return _Place(directory, fragment or DEFAULT_SSD, str(place))
+        self._used.add(place.path)
+        return _Place(directory, self.extract(place.path, directory, fragment), str(place))
 
     def inside(self, node: Node, fmu: _Place, uri: str) -> _Place:
         """A file in an FMU, extracted; the URI is relative to the root of the FMU."""
+        if fmu.path.is_dir():
+            place, _ = _Place(fmu.path, "", str(fmu)).refer(node, uri)
+            return place
         directory = self._directory(node)
         place, _ = _Place(directory, "", str(fmu)).refer(node, uri)
         with checked_archive(fmu.path, "FMU") as archive:
@@ -246,7 +286,23 @@ class _Reader:
             parameters = mapped(parameters, mapping, node.place, self._notes)
         return Binding(parameters, node.place)
 
+    def fmu(self, node: Node, place: _Place, fragment: str) -> Path:
+        """The FMU that a component refers to: a file, or the folder of one that is unpacked."""
+        if fragment or not is_fmu(place.file, place.root):
+            raise node.error(f"{place} is not an .fmu file", "rename it, and its source too")
+        if not place.path.exists():
+            raise ModelError(f"{node.place}: {place}: no such file{self._beside(place)}")
+        self._used.add(place.path)
+        return place.path
+
+    @staticmethod
+    def _beside(place: _Place) -> str:
+        """FMUs of the package with names like that of one that is missing."""
+        found = (path for pattern in ("*.fmu", "*/*.fmu") for path in place.root.glob(pattern))
+        return nearest(place.file, (path.relative_to(place.root).as_posix() for path in found))
+
     def _parse(self, place: _Place, root: str) -> Node:
+        self._used.add(place.path)
         try:
             size = place.path.stat().st_size
             if size > MAX_XML_BYTES:
@@ -346,7 +402,7 @@ class _Document:
         if kind == FMU_TYPE:
             self.reader.count(node, depth)
             component = Component(
-                name, self._fmu(node, target, fragment), connectors, bindings, node.place
+                name, self.reader.fmu(node, target, fragment), connectors, bindings, node.place
             )
             node.done()
             return component
@@ -374,21 +430,17 @@ class _Document:
             raise node.error(f"fragment {fragment!r:.100} of another SSD is not supported")
         return self.reader.nested(node, target, depth)
 
-    def _fmu(self, node: Node, target: _Place, fragment: str) -> Path:
-        if fragment or not target.file.lower().endswith(".fmu"):
-            raise node.error(f"{target} is not an .fmu file", "rename it, and its source too")
-        if not target.path.is_file():
-            raise ModelError(f"{node.place}: {target}: no such file")
-        return target.path
-
     def _connectors(self, node: Node) -> dict[str, Connector]:
         connectors: dict[str, Connector] = {}
         container = node.child("ssd:Connectors")
         for child in _children(container, "ssd:Connector"):
             connector = self._connector(child)
-            if connector.name in connectors:
+            first = connectors.setdefault(connector.name, connector)
+            if first is connector:
+                continue
+            if first != replace(connector, place=first.place):
                 raise child.error(f"there are two connectors {connector.name!r}")
-            connectors[connector.name] = connector
+            child.tell(f"connector {connector.name!r} is there twice")
         if container is not None:
             container.done()
         return connectors
@@ -482,7 +534,7 @@ def _inline(node: Node, name: str) -> Node:
 
 
 def _end(node: Node, which: str) -> tuple[str | None, str]:
-    element = node.required(f"{which}Element") if node.has(f"{which}Element") else None
+    element = node.attribute(f"{which}Element") or None
     return element, node.required(f"{which}Connector")
 
 

@@ -22,6 +22,7 @@ from master_node.ssp.reading import (
 from master_node.ssp.xml_nodes import NAMESPACES
 from master_node.start_values import GivenValue, structural_parameters
 from protocol.errors import ConfigurationError
+from protocol.files import as_file
 from protocol.names import nearest
 from protocol.slave import SlaveDescription, StartValue, Variable, VariableType
 
@@ -78,11 +79,11 @@ def write_package(
             archive.writestr(_entry(document, zipfile.ZIP_DEFLATED), xml)
         for file in dict.fromkeys(models.values()):
             slave = next(slave for slave, name in models.items() if name == file)
-            fmu = system.base / str(system.slaves[slave].model)
-            entry = _entry(f"resources/{file}", zipfile.ZIP_STORED)
-            entry.file_size = fmu.stat().st_size
-            with fmu.open("rb") as source, archive.open(entry, "w") as target:
-                shutil.copyfileobj(source, target)
+            with as_file(system.base / str(system.slaves[slave].model)) as fmu:
+                entry = _entry(f"resources/{file}", zipfile.ZIP_STORED)
+                entry.file_size = fmu.stat().st_size
+                with fmu.open("rb") as source, archive.open(entry, "w") as target:
+                    shutil.copyfileobj(source, target)
 
 
 def _entry(name: str, compression: int) -> zipfile.ZipInfo:
@@ -245,7 +246,7 @@ def _parameter_set(
     )
     parameters = etree.SubElement(root, f"{_SSV}Parameters")
     for name, value in settings.parameters.items():
-        where = f"{system.source}: [slaves.{slave}.parameters] {name!r}"
+        where = system.places.parameter(slave, name)
         elements = _elements(description, name)
         if not elements:  # an element that is there when a structural parameter has sized the array
             elements = _elements(description, name.rpartition("[")[0])
@@ -340,7 +341,7 @@ def _ends(
     system: System, number: int, descriptions: Mapping[str, SlaveDescription]
 ) -> tuple[tuple[str, str], tuple[str, str]]:
     connection = system.connections[number]
-    where = f"{system.source}: [[connections]] number {number + 1}"
+    where = system.places.connection(number)
     return (
         _variable(f"{where}: from = {connection.source!r}", connection.source, descriptions),
         _variable(f"{where}: to = {connection.target!r}", connection.target, descriptions),

@@ -120,13 +120,13 @@ class Node:
         return ConfigurationError(f"{self.place}: {self.name}: {cause}", remedy=remedy)
 
     def attribute(self, name: str, default: str = "") -> str:
-        """An attribute; ``default`` where it is missing."""
+        """An attribute; ``default`` where it is missing or empty."""
         self._read.add(name)
-        return str(self._element.get(name, default))
+        return str(self._element.get(name) or default)
 
     def has(self, name: str) -> bool:
-        """Whether there is an attribute of that name."""
-        return self._element.get(name) is not None
+        """Whether there is an attribute of that name; tools write empty ones for none."""
+        return bool(self.attribute(name))
 
     def required(self, name: str) -> str:
         """An attribute.
@@ -158,6 +158,10 @@ class Node:
     def count(self, name: str) -> None:
         """Note that something without influence is not carried."""
         self._notes.count(name)
+
+    def tell(self, sentence: str) -> None:
+        """Note something about this element that its user should know."""
+        self._notes.tell(f"{self.place}: {self.name}: {sentence}")
 
     def with_id(self, identifier: str) -> Node | None:
         """The descendant with that ``id``."""

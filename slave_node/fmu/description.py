@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 from fmpy import read_model_description
 
 from protocol.errors import ModelError
-from protocol.files import file_sha256
+from protocol.files import DESCRIPTION, Contents
 from protocol.slave import Causality, SlaveDescription, StartValue, StateKind, VariableType
 from slave_node.fmu.archive import extract
 from slave_node.fmu.embedded_python import log_categories, slave_module
@@ -35,7 +35,7 @@ class FmuModel:
     """An FMU that was extracted and read.
 
     Attributes:
-        fmu: the file.
+        fmu: the file, or the folder.
         directory: where it was extracted.
         description: for the master.
         interface: the one that is used.
@@ -56,7 +56,7 @@ class FmuModel:
 
 
 def describe_fmu(fmu: Path) -> SlaveDescription:
-    """The description of an FMU file, without loading its binary.
+    """The description of an FMU, without loading its binary.
 
     Raises:
         ModelError: the file is missing, unsafe, or not an FMU that can be run.
@@ -71,7 +71,7 @@ def read_fmu(
     """Extract an FMU and read its model description.
 
     Args:
-        fmu: the file.
+        fmu: the file, or the folder of one that is unpacked.
         directory: an empty one to extract it into.
         structural_parameters: values that hold instead of the start values.
 
@@ -81,7 +81,7 @@ def read_fmu(
     """
     extract(fmu, directory)
     try:
-        root = ElementTree.parse(directory / "modelDescription.xml").getroot()
+        root = ElementTree.parse(directory / DESCRIPTION).getroot()
         read_interface = _version(root)
         model_description = read_model_description(str(directory), validate=False)
         interface = read_interface(model_description, root)
@@ -95,7 +95,7 @@ def read_fmu(
                 root,
                 interface,
                 variables,
-                remarks=_remarks(directory, model_description, interface),
+                remarks=(*_hidden(variables), *_remarks(directory, model_description, interface)),
             ),
             interface,
             variables.places,
@@ -106,7 +106,7 @@ def read_fmu(
     except ModelError as error:
         raise ModelError(f"{fmu}: {error.cause}", remedy=error.remedy) from error
     except Exception as error:  # fmpy raises whatever its XML and type conversions raise
-        raise ModelError(f"{fmu}: modelDescription.xml cannot be read: {error}") from error
+        raise ModelError(f"{fmu}: {DESCRIPTION} cannot be read: {error}") from error
 
 
 _INTERFACES: Mapping[str, Callable[[Any, Element], Interface]] = {
@@ -152,7 +152,7 @@ def _description(
         default_step_size=default_step_size(model_description),
         units=units(model_description),
         remarks=remarks,
-        sha256=file_sha256(fmu),
+        sha256=Contents.of(fmu).sha256,
         guid=model_description.guid or "",
         generation_tool=model_description.generationTool or "",
     )
@@ -209,6 +209,19 @@ def _direct_dependencies(root: Element) -> dict[str, tuple[str, ...]]:
         for variable in root.iterfind("./ModelVariables/ScalarVariable[@causality='output']")
         if (found := variable.find("DirectDependency")) is not None
     }
+
+
+def _hidden(variables: Variables) -> tuple[str, ...]:
+    """That names stand for several variables."""
+    names = variables.hidden
+    if not names:
+        return ()
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    shown = ", ".join(map(repr, names[:3]))
+    return (
+        f"several variables are called {shown}{more}: the name stands for the one that is not "
+        "local, or for the first one",
+    )
 
 
 def _remarks(directory: Path, model_description: Any, interface: Interface) -> tuple[str, ...]:

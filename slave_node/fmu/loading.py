@@ -24,7 +24,7 @@ def load_fmu(
     """The slave for an FMU.
 
     Args:
-        fmu: the file.
+        fmu: the file, or the folder of one that is unpacked.
         directory: an empty directory to extract it into; the caller removes it.
         name: instance name.
         log_all: let the FMU log all its categories, not only its errors.

@@ -44,11 +44,13 @@ class Variables:
         scalars: the scalar variables, elements of arrays among them, in order.
         places: for each of them, by name.
         elements: names of the scalar variables of each declared variable, by its name.
+        hidden: names of local variables that another variable has too, and has alone here.
     """
 
     scalars: tuple[Variable, ...]
     places: Mapping[str, Place]
     elements: Mapping[str, tuple[str, ...]]
+    hidden: tuple[str, ...] = ()
 
 
 def read_variables(
@@ -56,21 +58,26 @@ def read_variables(
 ) -> Variables:
     """Variables with arrays taken apart into ``name[i]`` or ``name[i,j]``, indices from 1.
 
+    Of variables of one name the one that is not local is kept, or the first one.
+
     Args:
         model_description: of fmpy.
         root: of the same file, for what fmpy does not read.
         structural_parameters: values that hold instead of the start values.
 
     Raises:
-        ModelError: a structural parameter that there is not, or too many variables.
+        ModelError: a structural parameter that there is not, too many variables, or two of one
+            name that are not local.
         ValueError: a value is not of its type.
     """
     _check_structural_parameters(model_description, structural_parameters)
     starts = _listed_starts(root)
+    _read_unsigned_bounds(model_description, root)
     negated = {v.get("name") for v in root.iterfind("./ModelVariables/*[@alias='negatedAlias']")}
-    scalars: list[Variable] = []
+    scalars: dict[str, Variable] = {}
     places: dict[str, Place] = {}
     elements: dict[str, tuple[str, ...]] = {}
+    hidden: list[str] = []
     for declared in model_description.modelVariables:
         shape = [_extent(dimension, structural_parameters) for dimension in declared.dimensions]
         size = prod(shape)
@@ -83,14 +90,20 @@ def read_variables(
             values = [structural_parameters[declared.name]]
         kind = VariableType(declared.type)
         for element, (name, start) in enumerate(zip(names, values, strict=True)):
-            if name in places:
-                raise ModelError(f"two variables are called {name!r}")
-            scalars.append(_variable(declared, name, kind, start))
+            variable = _variable(declared, name, kind, start)
+            if name in scalars:
+                hidden.append(name)
+                if Causality.LOCAL not in (variable.causality, scalars[name].causality):
+                    raise ModelError(f"two variables are called {name!r}")
+                if variable.causality is Causality.LOCAL:
+                    continue
+            scalars[name] = variable
             places[name] = Place(
                 declared.valueReference, kind, element, size, declared.name in negated
             )
-        elements[declared.name] = tuple(names)
-    return Variables(tuple(scalars), places, elements)
+        if declared.causality != Causality.LOCAL or declared.name not in elements:
+            elements[declared.name] = tuple(names)
+    return Variables(tuple(scalars.values()), places, elements, tuple(dict.fromkeys(hidden)))
 
 
 def settable_variable(description: SlaveDescription, name: str) -> Variable:
@@ -168,6 +181,15 @@ def _listed_starts(root: Element) -> dict[str, list[str]]:
     }
 
 
+def _read_unsigned_bounds(model_description: Any, root: Element) -> None:
+    """Give fmpy's variables of unsigned types their ``min`` and ``max``, which it passes over."""
+    elements = {v.get("name"): v for v in root.iterfind("./ModelVariables/*")}
+    for declared in model_description.modelVariables:
+        if declared.type.startswith("UInt"):
+            element = elements[declared.name if declared.alias is None else declared.alias.name]
+            declared.min, declared.max = element.get("min"), element.get("max")
+
+
 def _texts(declared: Any, size: int) -> list[str]:
     if declared.start is None:
         return []
@@ -211,4 +233,18 @@ def _variable(declared: Any, name: str, kind: VariableType, start: StartValue | 
         start=start,
         nominal=abs(float(nominal)) if nominal and float(nominal) != 0.0 else 1.0,
         description=declared.description or "",
+        minimum=_bound(declared, kind, "min"),
+        maximum=_bound(declared, kind, "max"),
+        items={item.name: int(item.value) for item in declared_type.items}
+        if kind is VariableType.ENUMERATION and declared_type
+        else {},
     )
+
+
+def _bound(declared: Any, kind: VariableType, key: str) -> float | int | None:
+    """Smallest or largest value of a variable, or of its declared type; None: none is said."""
+    text = getattr(declared, key) or (declared.declaredType and getattr(declared.declaredType, key))
+    try:
+        return int(text) if kind.integer_range is not None else float(text)
+    except (TypeError, ValueError):
+        return None
