@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -320,8 +321,12 @@ class SimulationSettings(_Table):
 
     @property
     def largest(self) -> float:
-        """Largest communication step size [s]."""
-        return float(self.largest_step_size or (self.end - self.start_time) / 2)
+        """Largest communication step size [s]; by default two steps, also in decimal digits."""
+        if self.largest_step_size:
+            return float(self.largest_step_size)
+        start, end = float(self.start_time), self.end
+        in_decimals = (Fraction(repr(end)) - Fraction(repr(start))) / 2
+        return max((end - start) / 2, float(in_decimals))
 
     @property
     def polynomial(self) -> InputPolynomial:

@@ -163,14 +163,15 @@ class ControlledRun:
             position, self._results.memory = self._resumed.place(Position)
         self._reached(position)
         for target, crossing in self._targets():
-            while position.time < target:
+            while not self._limits.has_reached(position.time, target):
                 following = self._advance(position, target)
                 if isinstance(following, str):
                     return following
                 position = following
                 self._reached(position)
-            if crossing is not None and position.time < crossing[0].end:
-                following = self._cross(position, *crossing)
+            if crossing is not None and position.time < crossing[0].middle:
+                times = self._limits.crossed(position.time, crossing[0])
+                following = self._cross(position, times, crossing[1])
                 if isinstance(following, str):
                     return following
                 position = following
@@ -421,9 +422,10 @@ class ControlledRun:
     def _is_smallest(self, times: DoubleStepTimes, target: float) -> bool:
         """Whether no smaller H leads from T_n to ``target`` [s]."""
         smallest = self._limits.smallest
-        if times.first <= smallest:
+        if times.step_size <= smallest:
             return True
-        return times.first <= self._limits.times(self._start, times.begin, smallest, target).first
+        nearest = self._limits.times(self._start, times.begin, smallest, target)
+        return times.step_size <= nearest.step_size
 
     def _stuck(self, error: StepError, times: DoubleStepTimes) -> DoublestepError:
         reason = error.limiting_variable
@@ -435,8 +437,8 @@ class ControlledRun:
         remedy = "raise the tolerances or lower smallest_step_size"
         if self._limits.smallest == self._limits.largest:
             remedy = "raise the tolerances: a slave takes no other step size"
-        elif self._limits.quantum is not None and times.first == float(self._limits.quantum):
-            remedy = f"raise the tolerances: step sizes are multiples of {times.first!r} s"
+        elif self._limits.quantum is not None and times.step_size == float(self._limits.quantum):
+            remedy = f"raise the tolerances: step sizes are multiples of {times.step_size!r} s"
         loop = self._scheme.open_loop(self._coupled)
         if loop:
             remedy = (
@@ -447,7 +449,7 @@ class ControlledRun:
             f"rejected at the smallest communication step size: {reason}",
             phase="double step",
             time=times.begin,
-            step_size=times.first,
+            step_size=times.step_size,
             remedy=remedy,
         )
 
@@ -522,13 +524,14 @@ class ControlledRun:
 
     def _event(self, position: Position, step: DoubleStep) -> str:
         """What changed at once in a double step, in words; "" if nothing did."""
-        if position.event is not None and step.times.end >= position.event:
+        event = position.event
+        if event is not None and self._limits.has_reached(step.times.end, event):
             return "event"
         if not self._coupled.discrete.holds_inputs:
             return ""
         d_middle, d_end = step.discrete
         changed = self._coupled.discrete.changed
-        begin, middle, end, _, _ = step.times
+        begin, middle, end = step.times[:3]
         name = changed(position.outputs.d, d_middle, begin, middle)
         name = name or changed(d_middle, d_end, middle, end)
         return f"{name} changes" if name else ""
@@ -539,11 +542,11 @@ class ControlledRun:
         self, step: DoubleStep, error: StepError, reached: Reached, points: Points
     ) -> None:
         times, (order, slopes) = step.times, highest(step.polynomials)
-        limiting = error.limiting_variable
+        size, limiting = times.step_size, error.limiting_variable
         with self._interrupts:
-            count_accepted(self._statistics, times.first, reached)
+            count_accepted(self._statistics, size, reached)
             self._observer.attempted(
-                Attempt(times.begin, times.first, order, slopes, error.norm, True, limiting, points)
+                Attempt(times.begin, size, order, slopes, error.norm, True, limiting, points)
             )
 
     def _tell_rejected(
@@ -553,7 +556,7 @@ class ControlledRun:
         with self._interrupts:
             self._statistics.rejected_double_steps += 1
             self._observer.attempted(
-                Attempt(times.begin, times.first, order, slopes, norm, False, reason)
+                Attempt(times.begin, times.step_size, order, slopes, norm, False, reason)
             )
 
 

@@ -111,14 +111,15 @@ class DefectRun:
             position, self._results.memory = self._resumed.place(_Position)
         try:
             for target, crossing in self._targets():
-                while position.time < target:
+                while not self._limits.has_reached(position.time, target):
                     end, size = self._limits.step(
                         self._start, position.time, position.step_size, target
                     )
                     position = self._step(position, end, size)
                     self._checkpoints.reached(position, self._results.memory)
-                if crossing is not None and position.time < crossing[0].end:
-                    position = self._cross(position, *crossing)
+                if crossing is not None and position.time < crossing[0].middle:
+                    times = self._limits.crossed(position.time, crossing[0])
+                    position = self._cross(position, times, crossing[1])
                     self._checkpoints.reached(position, self._results.memory)
         except BrokenOffError as broken_off:  # a slave's wish
             time = self._statistics.time

@@ -148,7 +148,7 @@ class DoubleStepper:
         polynomials: Polynomials,
         outputs: Outputs,
     ) -> DoubleStep:
-        begin, middle, end, first, second = times
+        begin, middle, end, first, second, _ = times
         discrete = self._coupled.discrete
         held = discrete.held(outputs.y[0], outputs.d, begin)
         external = self._external.over(begin, middle)
@@ -169,7 +169,7 @@ class DoubleStepper:
 
         small_piece = Piece(first_inputs, external, held, DoStep(begin, first, True))
         if self._is_long_step:
-            past, size = history.every_second(), first + second
+            past, size = history.every_second(), times.long
             comparison_piece = Piece(
                 lambda known: self._inputs(past, polynomials, (begin, end), size, known).begin,
                 external_long,

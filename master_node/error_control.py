@@ -133,7 +133,7 @@ class ErrorControl:
     def nodes(self, step: DoubleStep) -> StepNodes:
         """Where the polynomials of a double step met their inputs."""
         polynomials, ahead = step.polynomials, self._known_ahead
-        begin, middle, end, _, _ = step.times
+        begin, middle, end = step.times[:3]
         nodes_at = self._extrapolation.nodes_at
         past = tuple([time - begin for time in step.history.times])
         before = past[1:]
@@ -154,7 +154,7 @@ class ErrorControl:
             ]
         else:
             nodes = self.nodes(step)
-            begin, middle, end, _, _ = step.times
+            begin, middle, end = step.times[:3]
             middle, end = middle - begin, end - begin
             ratios = [
                 self._exact_ratio(nodes, middle, end, kinds, direct)

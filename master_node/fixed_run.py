@@ -13,8 +13,10 @@ from master_node.result_points import ReachedPoint, ResultPoints, count_accepted
 from master_node.run_context import RunContext
 from master_node.single_step import SingleStepper, unrepeatable
 from master_node.step_requests import BrokenOffError
+from master_node.step_size_rules import fixed_step_limits
 from protocol.calls import DoStep
 from protocol.slave import StepStatus
+from protocol.step_sums import step_to
 
 _NAN = float("nan")
 _REMEDY = "lower --step-size, or use an estimator, which repeats such steps"
@@ -39,11 +41,18 @@ class FixedRun:
 
     def __init__(self, context: RunContext) -> None:
         self._context = context
+        settings = context.system.simulation
+        self._start, self._stop = float(settings.start_time), settings.end
+        self._step_size = settings.step_size
+        self._number = fixed_steps(self._start, self._stop, self._step_size)
+        self._limits = fixed_step_limits(context.system)
 
     def run(self, outputs: Outputs) -> str:
         """Step from outputs at T_0, those of continuous variables (rows, m), to the stop time.
 
-        Communication points are start + n H, so that rounding does not add up.
+        Communication points are start + n H, so that rounding does not add up, and step sizes
+        the differences of them. Where these are above the largest size that a slave takes, the
+        points fall behind by rounding, and the last step becomes two.
 
         Returns:
             A slave's wish to end earlier in words, or "".
@@ -51,7 +60,7 @@ class FixedRun:
         context = self._context
         coupled, scheme = context.coupled, context.scheme
         settings = context.system.simulation
-        start, stop, h = float(settings.start_time), settings.end, settings.step_size
+        start, stop, h = self._start, self._stop, self._step_size
         wanted = settings.polynomial
         stepper = SingleStepper(context)
         results = ResultPoints(settings.output_grid, scheme.has_derivative, start, outputs)
@@ -65,14 +74,13 @@ class FixedRun:
         if context.resumed is not None:
             place, results.memory = context.resumed.place(_Position)
             done, history, outputs = place
-        last = fixed_steps(start, stop, h)
         rounding = 8.0 * ulp(max(abs(start), abs(stop)))
-        for n in range(done + 1, last + 1):
+        while done < self._number or not self._limits.has_reached(history.times[0], stop):
+            done += 1
             time = history.times[0]
-            end = start + n * h if n < last else stop
+            end, size = self._next(time, done)
             polynomials = scheme.extrapolation.polynomials(wanted, len(history.times))
-            rest = end - time  # H but for rounding, unless the last step is a shorter one
-            step = DoStep(time, h if abs(rest - h) <= rounding else rest, True)
+            step = DoStep(time, size, True)
             try:
                 outputs = stepper.take(history, polynomials, end, step, outputs)
             except BrokenOffError as broken_off:
@@ -85,10 +93,22 @@ class FixedRun:
             reached = (ReachedPoint(end, *outputs),)
             order, slopes = highest(polynomials)
             points = results.reached(reached, order)
+            taken = h if abs(size - h) <= rounding else size
             with context.interrupts:
-                count_accepted(context.statistics, step.step_size, reached)
+                count_accepted(context.statistics, taken, reached)
                 context.observer.attempted(
-                    Attempt(time, step.step_size, order, slopes, _NAN, True, "", points)
+                    Attempt(time, taken, order, slopes, _NAN, True, "", points)
                 )
-            context.checkpoints.reached(_Position(n, history, outputs), results.memory)
+            context.checkpoints.reached(_Position(done, history, outputs), results.memory)
         return ""
+
+    def _next(self, time: float, number: int) -> tuple[float, float]:
+        """The end and the size [s] of the step of this ``number`` from ``time`` [s]."""
+        limits, stop = self._limits, self._stop
+        end = stop
+        if number < self._number:
+            end = self._start + number * self._step_size
+        elif number == self._number and limits.quantum is None and stop - time > limits.longest:
+            end = time + 0.5 * (stop - time)
+        size = step_to(time, end, largest=limits.longest)
+        return limits.reached(time + size, end), size

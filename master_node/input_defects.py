@@ -65,7 +65,7 @@ class InputDefects:
 
     def _growth(self, step: DoubleStep) -> float:
         """How much larger a defect at T_n + 2H is than at T_n + H where everything is smooth."""
-        begin, middle, end, _, _ = step.times
+        begin, middle, end = step.times[:3]
         past = step.history.times
         first = self._extrapolation.nodes(past[1:], step.polynomials, begin)
         second = self._extrapolation.nodes(past, step.polynomials, begin)

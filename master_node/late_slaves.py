@@ -66,7 +66,7 @@ class LateSlaves:
             BrokenOffError: a slave wants to end the simulation.
             DoublestepError: a slave is lost, or did not complete a step.
         """
-        start, middle, end, first, second = step.times
+        start, middle, end, first, second, _ = step.times
         discrete = self._coupled.discrete
         d_middle, d_end = step.discrete
         held = discrete.held(begin.y[0], begin.d, start)

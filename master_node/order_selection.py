@@ -101,7 +101,7 @@ class OrderSelection:
             self._slave_of_input,
             slaves,
         )
-        begin, middle, end, step_size, _ = step.times
+        begin, middle, end, step_size = step.times[:4]
         nodes = self._control.nodes(step)
         taken = self._candidate(
             memory.polynomial,

@@ -107,16 +107,25 @@ def check_step_sizes(system: System) -> None:
         ConfigurationError: there are none.
     """
     if system.simulation.estimator == "none":
-        step_size = system.simulation.step_size
-        _limits(
-            system,
-            step_size,
-            step_size,
-            long_step=False,
-            given_by="the fixed step, initial_step_size or --step-size",
-        )
+        fixed_step_limits(system)
     else:
         step_size_limits(system)
+
+
+def fixed_step_limits(system: System) -> StepSizeLimits:
+    """What the slaves' rules say of the fixed step of the simulation.
+
+    Raises:
+        ConfigurationError: it contradicts them.
+    """
+    step_size = system.simulation.step_size
+    return _limits(
+        system,
+        step_size,
+        step_size,
+        long_step=False,
+        given_by="the fixed step, initial_step_size or --step-size",
+    )
 
 
 def _limits(
@@ -142,7 +151,14 @@ def _limits(
     if smallest < resolution:
         smallest, given_by = resolution, f"the numbers near t={max(start, stop, key=abs)!r} s"
     try:
-        limits = StepSizeLimits.of(rules, smallest, largest, long_step=long_step, given_by=given_by)
+        limits = StepSizeLimits.of(
+            rules,
+            smallest,
+            largest,
+            long_step=long_step,
+            given_by=given_by,
+            stop_time=stop,
+        )
         together = 1 if system.simulation.estimator == "none" else 2
         limits.check_span(start, stop, together)
     except StepSizeLimitsError as error:

@@ -25,6 +25,7 @@ from protocol.slave import (
     StartValue,
     StepStatus,
 )
+from protocol.step_sums import step_to
 from slave_node.substep_inputs import scaled, substep_values, substeps_needed
 
 DEFAULT = Configure()
@@ -232,7 +233,7 @@ class SubstepSlave(Slave):
         inputs = self._inputs
         is_emulated = self._derivatives is InputDerivatives.EMULATED and inputs.order > 0
         rows = scaled(inputs.derivatives, step_size) if is_emulated else None
-        number, is_free = self._split(rows, step_size)
+        number, size, is_free = self._split(rows, step_size)
         meets_end = is_emulated and self._meets_end and is_free and not self._follows
         lengths = _lengths(number, meets_end=meets_end)
         last = len(lengths) - 1
@@ -245,12 +246,10 @@ class SubstepSlave(Slave):
             elif i and inputs.order > 0:
                 self._slave.set_inputs(inputs.shifted(time - begin).derivatives)
             offset += length
-            size = (end if i == last else begin + offset * step_size) - time
-            if last == 0:
-                size = step_size
-            elif self._fixed is not None:
-                size = self._fixed
-            result = self._slave.do_step(time, size, no_set_state_prior and i == 0)
+            to = end if i == last else begin + ((i + 1) * size if size else offset * step_size)
+            result = self._slave.do_step(
+                time, step_to(time, min(to, end), size), no_set_state_prior and i == 0
+            )
             time = result.time
             if result.status is not _OK:
                 break
@@ -264,14 +263,15 @@ class SubstepSlave(Slave):
     def _begin(self, communication_point: float, step_size: float) -> float:
         """Where the model stands, if that is the communication point but for rounding.
 
-        Fixed steps add up by themselves, and a strict model knows only its own sum.
+        Its own sum of substeps may miss the end of the whole step, and a strict model knows only
+        that sum.
         """
         rounding = _ON_GRID * step_size + 16.0 * math.ulp(communication_point)
         is_there = abs(self._standing - communication_point) <= rounding
         return self._standing if is_there else communication_point
 
-    def _split(self, rows: FloatArray | None, step_size: float) -> tuple[int, bool]:
-        """How many substeps, and whether they may have any length.
+    def _split(self, rows: FloatArray | None, step_size: float) -> tuple[int, float | None, bool]:
+        """How many substeps, their size if it is given [s], and whether they may have any other.
 
         ``rows`` are those of the polynomial, `scaled`, if it is to be emulated.
         """
@@ -279,15 +279,16 @@ class SubstepSlave(Slave):
             if size is not None:
                 number = round(step_size / size)
                 if number and abs(number * size - step_size) <= _ON_GRID * step_size:
-                    return number, False
+                    return number, size if number > 1 else step_size, False
         if self._fixed is not None:
-            return 1, False  # for the model to refuse
+            return 1, step_size, False  # for the model to refuse
         number = 1
         if rows is not None:
             number = self._number or substeps_needed(rows, self._nominal, self._tolerance)
         if self._largest is not None:
             number = max(number, math.ceil(step_size / self._largest))
-        return number, self.description.capabilities.can_handle_variable_step_size
+        given = step_size if number == 1 else None
+        return number, given, self.description.capabilities.can_handle_variable_step_size
 
     # ---- Saved states -------------------------------------------------------------------------
 

@@ -98,7 +98,7 @@ def test_fmus_are_valid(capability_dir: Path) -> None:
     """Archive and model description of every FMU keep the rules of their version of FMI."""
     fmus = sorted(capability_dir.glob("*.fmu"))
     problems = {fmu.stem: validate_fmu(str(fmu)) for fmu in fmus}
-    assert len(fmus) == 51
+    assert len(fmus) == 52
     assert {name: found for name, found in problems.items() if found} == {}
 
 
@@ -432,7 +432,7 @@ SOUND_LAGS = (
     "error_on_restore",
     "starts_thread",
     "writes_file",
-    "strict_point",
+    "plain_lag",
     "execution_tool",
 )
 
@@ -607,17 +607,16 @@ def test_euler_per_step_is_that(instance: Open) -> None:
     assert made.get("y") == [2.0 + 0.125 * (3.0 - 2.0) / 0.5]
 
 
-@pytest.mark.parametrize("name", ["strict_point", "execution_tool"])
-def test_strict_point_compares_bits(instance: Open, name: str) -> None:
-    """A communication point one unit in the last place beside it: only strict_point refuses."""
+@pytest.mark.parametrize("name", ["plain_lag", "execution_tool"])
+def test_communication_points_are_compared_bit_by_bit(instance: Open, name: str) -> None:
+    """A communication point one unit in the last place beside it is refused."""
     made = started(instance(Slave2, name))
     made.step(0.1)
     made.step(0.2)
     assert made.time == 0.1 + 0.2 != 0.3
     made.time = 0.3
-    if name == "strict_point":
-        assert "stands at" in refusal(made, partial(made.step, 0.1))
-        made.time = 0.1 + 0.2
+    assert "stands at" in refusal(made, partial(made.step, 0.1))
+    made.time = 0.1 + 0.2
     assert "not advance" in refusal(made, partial(made.step, 0.0))
     made.step(0.1)
 
@@ -934,7 +933,7 @@ def test_licence_error_needs_a_licence(
 def test_execution_tool_says_so(extract: Callable[[str], Extracted]) -> None:
     """execution_tool declares that it needs its tool, and no other FMU does."""
     assert extract("execution_tool").description.coSimulation.needsExecutionTool
-    assert not extract("strict_point").description.coSimulation.needsExecutionTool
+    assert not extract("plain_lag").description.coSimulation.needsExecutionTool
 
 
 # ---- All of them --------------------------------------------------------------------------------

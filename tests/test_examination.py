@@ -221,7 +221,7 @@ def load(capability_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
     ("name", "verdict"),
     [
         ("chassis_no_derivatives", StateVerdict.EXACT),
-        ("strict_point", StateVerdict.EXACT),
+        ("plain_lag", StateVerdict.EXACT),
         ("discards", StateVerdict.EXACT),
         ("restarting_solver", StateVerdict.RESTARTS_SOLVER),
         ("not_repeating", StateVerdict.DOES_NOT_REPEAT),

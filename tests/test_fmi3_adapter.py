@@ -16,6 +16,7 @@ from protocol.calls import Configure
 from protocol.errors import ModelError, SlaveError
 from protocol.signals import InputSignal
 from protocol.slave import Causality, InputDerivatives, Slave, StartValue, StepStatus, VariableType
+from protocol.step_sums import step_to
 from slave_node.fmu.description import describe_fmu
 from slave_node.fmu.loading import load_fmu
 from slave_node.inspection import description_tables
@@ -516,6 +517,30 @@ def test_events_within_a_step_are_handled(load: Load, step_size: float) -> None:
         assert status is StepStatus.OK
         np.testing.assert_allclose(slave.get_outputs(0)[0, 0], staircase(t), rtol=1e-12)
     assert slave.get_discrete_outputs() == (int((t + 1e-9) / STAIR),)
+
+
+@pytest.mark.parametrize("name", ["event_mode3", "rounds_events3"])
+@pytest.mark.parametrize("early_return", [False, True])
+def test_events_a_rounding_beside_the_end_of_a_step(
+    load: Load, name: str, early_return: bool
+) -> None:
+    """At the end of a step the level has risen, and the FMU is asked to go on from where it stands.
+
+    3 times 0.35 s is a rounding before 1.05 s, and one of the FMUs rounds the other way: it returns
+    early at an event that it comes to just beyond the end of the step.
+    """
+    slave = started(
+        load(name), outputs=("y",), discrete_outputs=("level",), early_return=early_return
+    )
+    event = 3 * STAIR
+    ends = {"event_mode3": 1.05, "rounds_events3": math.nextafter(event, 0.0)}
+    assert ends[name] != event
+    t = 0.0
+    for end in (0.2, STAIR, 0.5, 2 * STAIR, 0.9, ends[name], 1.2, 4 * STAIR, 1.6):
+        assert slave.do_step(t, step_to(t, end), False) == (StepStatus.OK, end)
+        t = end
+        assert slave.get_discrete_outputs() == (int((t + 1e-9) / STAIR),)
+        np.testing.assert_allclose(slave.get_outputs(0)[0, 0], staircase(t), rtol=1e-12)
 
 
 def test_an_early_return_is_an_event_for_the_master(load: Load) -> None:

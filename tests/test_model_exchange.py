@@ -65,11 +65,12 @@ def started(
     discrete_outputs: Sequence[str] = (),
     early_return: bool = False,
     start_values: Mapping[str, StartValue] | None = None,
+    stop_time: float | None = None,
 ) -> Slave:
     """The slave at its first communication point, t = 0."""
     slave.initialize(
         start_time=0.0,
-        stop_time=None,
+        stop_time=stop_time,
         relative_tolerance=tolerance,
         start_values=start_values or {},
         inputs=inputs,
@@ -92,10 +93,13 @@ def wheel(load: Load, version: int, tolerance: float | None = 1e-9) -> Slave:
     )
 
 
-def ball(load: Load, version: int, *, early_return: bool = False) -> Slave:
+def ball(
+    load: Load, version: int, *, early_return: bool = False, stop_time: float | None = None
+) -> Slave:
     """The bouncing ball."""
     return started(
-        load(f"bouncing_ball_me{version}"),
+        stop_time=stop_time,
+        slave=load(f"bouncing_ball_me{version}"),
         tolerance=1e-10,
         outputs=("h", "v"),
         discrete_outputs=("bounces",),
@@ -336,6 +340,23 @@ def test_an_early_return_stops_at_the_bounce(load: Load, version: int) -> None:
         t += event - t
         assert slave.get_discrete_outputs() == (i + 1,)
     assert slave.do_step(t, 2.0 - t, False).status is StepStatus.OK
+
+
+@pytest.mark.parametrize("early_return", [False, True])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_fmu_is_never_beyond_its_stop_time(
+    load: Load, version: int, early_return: bool
+) -> None:
+    """Not even to see whether the ball bounces just behind the end of the step.
+
+    The FMU refuses such a time. A microsecond earlier than the stop time it is looked for.
+    """
+    (bounce, *_), _, _ = bounces(2.0)
+    for ahead, stop_time in ((0, bounce - 1e-6), (early_return, bounce + 1e-6)):
+        slave = ball(load, version, early_return=early_return, stop_time=stop_time)
+        end = bounce - 1e-6
+        assert slave.do_step(0.0, end, False) == (StepStatus.OK, end)
+        assert slave.get_discrete_outputs() == (int(ahead),)
 
 
 @pytest.mark.parametrize("version", VERSIONS)

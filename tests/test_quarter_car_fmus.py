@@ -368,8 +368,10 @@ def test_time_is_one_addition(slave: SlaveFactory) -> None:
     made.fmu.doStep(0.0, 0.1)
     made.fmu.doStep(0.1, 0.2)
     assert made.time == 0.1 + 0.2 != 0.3
-    made.fmu.doStep(0.3, 0.1)  # one ulp beside it
-    assert made.time == 0.3 + 0.1
+    status, message = refusal(made, lambda: made.fmu.doStep(0.3, 0.1))  # one ulp beside it
+    assert status == ERROR
+    assert "stands at" in message
+    assert made.time == 0.1 + 0.2
 
 
 @pytest.mark.parametrize("point", [0.0, 0.1 + 1e-12, 0.1 - 1e-12, 0.2, math.nan, math.inf])
@@ -393,14 +395,15 @@ def test_step_that_does_not_advance_is_refused(slave: SlaveFactory, step_size: f
 
 
 def test_no_step_leads_past_the_stop_time(slave: SlaveFactory) -> None:
-    """The stop time may be missed by rounding, not by a step."""
+    """Not even by rounding: 0.2 + 0.1 is beyond 0.3 by one unit in the last place."""
     made = slave("wheel").initialize(stop_time=0.3)
-    for _ in range(3):
+    for _ in range(2):
         made.step(0.1)
-    assert made.time > 0.3
     status, message = refusal(made, lambda: made.step(0.1))
     assert status == ERROR
-    assert "stop time" in message
+    assert "beyond the stop time" in message
+    made.step(math.nextafter(0.1, 0.0))
+    assert made.time == 0.3
 
 
 def test_discard_tells_how_far_it_came(slave: SlaveFactory) -> None:

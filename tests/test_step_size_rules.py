@@ -163,7 +163,7 @@ def test_the_bounds_hold_to_the_last_step(
         assert smallest - 1e-12 <= times.first <= largest + 1e-12
         assert smallest - 1e-12 <= times.second <= largest + 1e-12
         for multiple in multiples:
-            assert Fraction(repr(times.first)) % Fraction(repr(multiple)) == 0
+            assert Fraction(repr(times.step_size)) % Fraction(repr(multiple)) == 0
         assert times.end > time
         time, number = times.end, number + 1
     assert time == target
@@ -181,11 +181,11 @@ def test_rounding_makes_no_gap(begin: float, smallest: float, number: int, ratio
         target += 2.0 * smallest
     assert limits.leads(begin, begin, target)
     slack = 1e-6 * smallest + 1e-15 * abs(begin)
-    while time < target:
+    while not limits.has_reached(time, target):
         times = limits.times(begin, time, smallest, target)
         assert smallest - slack <= times.first <= limits.largest + slack
         time = times.end
-    assert time == target
+    assert time == target or target > 2.0 * times.middle
 
 
 def test_what_no_double_steps_fill_is_told() -> None:
@@ -258,7 +258,7 @@ def test_a_step_is_the_way_to_its_end_and_not_above_h(begin: float, step_size: f
 
 
 class OnTime(LinearSlave):
-    """Knows its time, also after it was set back, and refuses a step that begins elsewhere."""
+    """Knows its time to the last bit, also after it was set back."""
 
     def __init__(self, *arguments: Any) -> None:
         self.time = 0.0
@@ -267,7 +267,7 @@ class OnTime(LinearSlave):
 
     def do_step(self, communication_point: float, step_size: float, prior: bool) -> StepResult:
         """See `Slave`."""
-        assert communication_point == pytest.approx(self.time, rel=1e-14)
+        assert communication_point == self.time
         self.time = communication_point + step_size
         return super().do_step(communication_point, step_size, prior)
 

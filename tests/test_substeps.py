@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from master_node import simulate
 from protocol.calls import Configure, StepResult
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.slave import InputDerivatives, Slave, StepStatus
+from protocol.step_sums import step_to
 from slave_node.loading import describe_model, load_slave
 from slave_node.substep_inputs import MAX_SUBSTEPS, scaled, substep_values, substeps_needed
 from slave_node.substeps import SubstepSlave, with_substeps
@@ -195,17 +197,26 @@ def test_only_the_first_substep_gives_up_older_states() -> None:
     assert flags == [True, False, False]
 
 
-def test_a_slave_with_its_own_step_size_gets_no_other() -> None:
-    """A model with fixed steps is driven by multiples of them; its own sums of times are kept."""
+@given(st.integers(-2000, 2000), st.lists(st.integers(1, 12), min_size=1, max_size=8))
+def test_a_slave_with_its_own_step_size_gets_no_other(origin: int, numbers: list[int]) -> None:
+    """A model with fixed steps is driven by these: by exactly so many, of that size but for the
+    rounding of the times, each from where it stands and none beyond the communication step.
+    """
     inner = timed()
     described(inner, fixed_step_size=0.01)
     slave = emulated(inner)
-    time = 0.0
-    for number in (1, 3, 10, 6):
+    begin = time = origin / 100
+    for number in numbers:
         slave.set_inputs(polynomial_rows(2, 1e-3))
-        slave.do_step(time, number * 0.01, True)
-        time = round(time + number * 0.01, 10)
-    assert [size for _, size in inner.steps] == [0.01] * 20
+        size = step_to(time, float(Fraction(origin + number, 100)), number * 0.01)
+        slave.do_step(time, size, True)
+        time, origin = time + size, origin + number
+        assert time - math.ulp(abs(time) + 0.1) <= inner.steps[-1][0] + inner.steps[-1][1] <= time
+    assert len(inner.steps) == sum(numbers)
+    for point, size in inner.steps:
+        assert point == begin
+        assert size == pytest.approx(0.01, abs=4.0 * math.ulp(abs(point) + 0.1))
+        begin = point + size
 
 
 @pytest.mark.parametrize("capabilities", [ALL, HELD])

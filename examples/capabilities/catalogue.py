@@ -321,10 +321,7 @@ def lags() -> Iterator[Fmu]:
     )
     plain = (*LAG, SOURCES / "plain_lag.c")
     yield make_fmu(
-        lag_description("strict_point", "A lag that takes its communication point bit by bit"),
-        plain,
-        capabilities=whole,
-        definitions={"POINT_TOLERANCE": "0.0"},
+        lag_description("plain_lag", "A lag with nothing special"), plain, capabilities=whole
     )
     yield make_fmu(
         lag_description("execution_tool", "A lag that needs the tool that it comes from"),
@@ -366,21 +363,24 @@ def _ends() -> Iterator[Fmu]:
         version=3,
         capabilities=Capabilities(output_derivatives=1),
     )
-    yield make_fmu(
-        Description(
-            name="event_mode3",
-            description="A staircase with a step every 0.35 s, and a lag that follows it",
-            variables=(
-                Variable("level", LAG_REFERENCES, "output", "Int32", depends=()),
-                *lag_variables()[1:],
+    stairs = (("event_mode3", None), ("rounds_events3", {"ROUNDS_EVENTS": "1"}))
+    for name, definitions in stairs:
+        yield make_fmu(
+            Description(
+                name=name,
+                description="A staircase with a step every 0.35 s, and a lag that follows it",
+                variables=(
+                    Variable("level", LAG_REFERENCES, "output", "Int32", depends=()),
+                    *lag_variables()[1:],
+                ),
+                units=(SECOND,),
+                experiment=EXPERIMENT,
             ),
-            units=(SECOND,),
-            experiment=EXPERIMENT,
-        ),
-        (*LAG, SOURCES / "event_mode.c"),
-        version=3,
-        capabilities=Capabilities(event_mode=True, returns_early=True),
-    )
+            (*LAG, SOURCES / "event_mode.c"),
+            version=3,
+            capabilities=Capabilities(event_mode=True, returns_early=True),
+            definitions=definitions,
+        )
 
 
 # ---- Many variables, units, loops ---------------------------------------------------------------

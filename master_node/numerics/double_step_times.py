@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from math import nextafter
+from math import inf, nextafter
 from typing import NamedTuple
+
+from protocol.step_sums import step_to
 
 
 class DoubleStepTimes(NamedTuple):
     """T_n, T_n + H and T_n + 2H [s], with the step sizes between them.
 
-    The times are given beside the step sizes so that a run's last point is the stop time itself
-    and points on a grid are multiples of its interval, not sums of rounded steps.
+    Slaves are told the points and the sizes to the last bit: begin + first is the middle and
+    middle + second the end, as slaves add them (`step_to`), and neither is beyond what was wanted.
 
     Attributes:
         begin, middle, end: communication points [s].
         first, second: sizes of the small steps [s]; both are H but for the rounding of the times.
-            See `step_end`.
+        step_size: H [s].
     """
 
     begin: float
@@ -23,17 +25,37 @@ class DoubleStepTimes(NamedTuple):
     end: float
     first: float
     second: float
+    step_size: float
 
     @staticmethod
-    def from_step_size(
-        begin: float, step_size: float, stop_time: float | None = None
-    ) -> DoubleStepTimes:
-        """Two steps of H [s]; with ``stop_time`` the second ends exactly there."""
+    def from_step_size(begin: float, step_size: float) -> DoubleStepTimes:
+        """Two steps of H [s]. See `step_end`."""
         middle, first = step_end(begin, step_size)
-        if stop_time is not None:
-            return DoubleStepTimes(begin, middle, stop_time, first, stop_time - middle)
         end, second = step_end(middle, step_size)
-        return DoubleStepTimes(begin, middle, end, first, second)
+        return DoubleStepTimes(begin, middle, end, first, second, first)
+
+    @staticmethod
+    def through(
+        begin: float, middle: float, end: float, step_size: float, largest: float = inf
+    ) -> DoubleStepTimes:
+        """Two steps of H over these points [s], or where no size leads there just before them.
+
+        Args:
+            begin: communication point [s].
+            middle: the next one [s].
+            end: the one after that [s].
+            step_size: H [s], but for rounding the difference of the points.
+            largest: bound of H [s].
+        """
+        first = step_to(begin, middle, step_size, largest)
+        middle = begin + first
+        second = step_to(middle, end, step_size, largest)
+        return DoubleStepTimes(begin, middle, middle + second, first, second, step_size)
+
+    @property
+    def long(self) -> float:
+        """The size of one step over both [s]: 2H, but not beyond the end."""
+        return step_to(self.begin, self.end, self.first + self.second, self.first + self.second)
 
 
 def step_end(begin: float, step_size: float) -> tuple[float, float]:

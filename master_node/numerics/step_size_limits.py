@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import ceil, lcm, ulp
+from math import ceil, inf, lcm, ulp
 from typing import NamedTuple, TypeVar
 
 from master_node.numerics.double_step_times import DoubleStepTimes, step_end
 from master_node.numerics.step_size_controller import last_step_size
+from protocol.step_sums import step_to
 
 _ROUNDING = 1e-10
-"""Part of the smallest H by which a step may miss its bounds, as differences of times do."""
+"""Part of the smallest H by which a step may be smaller, as differences of times are."""
+
+
+_NO_STEP = 0.25
+"""Part of the smallest H that is left over by rounding only."""
 
 
 class SlaveLimits(NamedTuple):
@@ -37,11 +42,15 @@ class StepSizeLimits:
         smallest, largest: bounds of H [s].
         quantum: every H is a multiple of this [s], in the decimal digits that were given; None:
             any H.
+        longest: H that the slaves take at most [s]: no step is longer, by the last bit.
+        stop_time: where no step begins [s]: what ends a rounding before it ends there.
     """
 
     smallest: float
     largest: float
     quantum: Fraction | None = None
+    longest: float = inf
+    stop_time: float = inf
 
     @staticmethod
     def of(
@@ -51,6 +60,7 @@ class StepSizeLimits:
         *,
         long_step: bool,
         given_by: str = "the simulation",
+        stop_time: float = inf,
     ) -> StepSizeLimits:
         """The rules of all slaves, within the bounds of the simulation.
 
@@ -60,23 +70,23 @@ class StepSizeLimits:
             largest: bound of the simulation [s].
             long_step: whether steps of 2H are taken too.
             given_by: what to call the source of these bounds in messages.
+            stop_time: of the simulation [s].
 
         Raises:
             StepSizeLimitsError: they contradict each other.
         """
-        longest = 2 if long_step else 1
+        together = 2 if long_step else 1
         low = max(
             [(smallest, given_by)]
             + [(s.smallest_step_size, s.name) for s in slaves if s.smallest_step_size is not None]
         )
-        high = min(
-            [(largest, given_by)]
-            + [
-                (s.largest_step_size / longest, s.name)
-                for s in slaves
-                if s.largest_step_size is not None
-            ]
-        )
+        ceilings = [
+            (s.largest_step_size / together, s.name)
+            for s in slaves
+            if s.largest_step_size is not None
+        ]
+        high = min([(largest, given_by), *ceilings])
+        longest = min((bound for bound, _ in ceilings), default=inf)
         multiples = [_decimal(s.step_multiple) for s in slaves if s.step_multiple is not None]
         quantum = _common(multiples)
         fixed = _fixed(slaves, multiples, long_step=long_step)
@@ -91,7 +101,7 @@ class StepSizeLimits:
                 f"the smallest step size {low[0]!r} s (of {low[1]}) is above the largest one, "
                 f"{high[0]!r} s (of {high[1]})"
             )
-        return StepSizeLimits(low[0], high[0], quantum)
+        return StepSizeLimits(low[0], high[0], quantum, longest, stop_time)
 
     def check_span(self, begin: float, end: float, together: int = 2) -> None:
         """Whether steps lead from ``begin`` to ``end`` [s], ``together`` of one size each time.
@@ -176,20 +186,40 @@ class StepSizeLimits:
             target: where double steps must end [s].
         """
         if self.quantum is None:
-            size = last_step_size(begin, target, step_size)
-            left = (target - begin) / 2.0
-            rounding = self._rounding(begin, target)
-            size = _planned(size, left, self.smallest, self.largest, rounding)
-            is_last = size >= left
-            return DoubleStepTimes.from_step_size(begin, size, target if is_last else None)
-        quantum, zero = self.quantum, _decimal(origin)
-        done = self._units(origin, begin)
-        left_units = (self._units(origin, target) - done) // 2
-        units = self._planned_units(step_size, left_units)
-        size = float(units * quantum)
-        middle = float(zero + (done + units) * quantum)
-        end = float(zero + (done + 2 * units) * quantum)
-        return DoubleStepTimes(begin, middle, end, size, size)
+            times = self._free_times(begin, step_size, target)
+        else:
+            quantum, zero = self.quantum, _decimal(origin)
+            done = self._units(origin, begin)
+            left_units = (self._units(origin, target) - done) // 2
+            units = self._planned_units(step_size, left_units)
+            middle = float(zero + (done + units) * quantum)
+            end = float(zero + (done + 2 * units) * quantum)
+            size = float(units * quantum)
+            times = DoubleStepTimes.through(begin, middle, end, size, self.longest)
+        return times._replace(end=self.reached(times.end, target))
+
+    def _free_times(self, begin: float, step_size: float, target: float) -> DoubleStepTimes:
+        left = (target - begin) / 2.0
+        size = self._planned(last_step_size(begin, target, step_size), left, begin, target)
+        times = DoubleStepTimes.from_step_size(begin, min(size, self.longest))
+        if size < left:
+            return times
+        times = DoubleStepTimes.through(begin, times.middle, target, size)
+        if max(times.first, times.second) <= self.largest:
+            return times
+        half = 0.5 * size  # rounding makes two of this size too long, so there are two more
+        if half >= self.smallest - self._rounding(begin, target):
+            return DoubleStepTimes.from_step_size(begin, half)
+        return DoubleStepTimes.through(begin, times.middle, target, size, self.longest)
+
+    def reached(self, end: float, target: float) -> float:
+        """The end of a step towards ``target`` [s]: itself, or the stop time if it is just that."""
+        is_last = target == self.stop_time and self.has_reached(end, target)
+        return target if is_last else end
+
+    def has_reached(self, time: float, target: float) -> bool:
+        """Whether ``time`` is ``target`` [s], or nearer to it than any step leads."""
+        return target - time < _NO_STEP * self.smallest
 
     def is_cut_short(self, times: DoubleStepTimes, step_size: float) -> bool:
         """Whether a double step has a smaller H than it would have with nothing to end on.
@@ -200,7 +230,7 @@ class StepSizeLimits:
         """
         if self.quantum is None:
             return times.first < DoubleStepTimes.from_step_size(times.begin, step_size).first
-        return _decimal(times.first) + self.quantum <= _decimal(step_size)
+        return _decimal(times.step_size) + self.quantum <= _decimal(step_size)
 
     def step(
         self, origin: float, begin: float, step_size: float, target: float
@@ -212,14 +242,24 @@ class StepSizeLimits:
         if self.quantum is None:
             left = target - begin
             size = left if step_size >= left else min(step_size, left / 2.0)
-            rounding = self._rounding(begin, target)
-            size = _planned(size, left, self.smallest, self.largest, rounding)
-            return (target, left) if size >= left else step_end(begin, size)
-        quantum, zero = self.quantum, _decimal(origin)
-        done = self._units(origin, begin)
-        units_left = self._units(origin, target) - done
-        units = self._planned_units(step_size, units_left)
-        return float(zero + (done + units) * quantum), float(units * quantum)
+            size = self._planned(size, left, begin, target)
+            end, size = (target, left) if size >= left else step_end(begin, size)
+        else:
+            quantum, zero = self.quantum, _decimal(origin)
+            done = self._units(origin, begin)
+            units = self._planned_units(step_size, self._units(origin, target) - done)
+            end, size = float(zero + (done + units) * quantum), float(units * quantum)
+        size = step_to(begin, end, size, self.longest)
+        return self.reached(begin + size, target), size
+
+    def _planned(self, size: float, left: float, begin: float, target: float) -> float:
+        """See `_planned`; above the largest H by rounding only where nothing else leads there."""
+        rounding = self._rounding(begin, target)
+        low = self.smallest - rounding
+        planned = _planned(size, left, low, self.largest, rounding)
+        if planned <= self.largest:
+            return planned
+        return _planned(size, left, low, self.largest + rounding, rounding)
 
     def _planned_units(self, step_size: float, left: int) -> int:
         """Of how many quanta the next H is, with ``left`` of them to fill."""
@@ -230,7 +270,7 @@ class StepSizeLimits:
             units = left
         elif 2 * units > left:
             units = (left + 1) // 2
-        return max(1, _planned(units, left, fewest, self._most, 0))
+        return max(1, _planned(units, left, fewest, self._most))
 
     def _rounding(self, begin: float, end: float) -> float:
         """By what H of a double step between these times may miss its bounds [s]."""
@@ -263,17 +303,30 @@ class StepSizeLimits:
         if self.quantum is None:
             mirrored, first = step_end(-event, size)
             end, second = step_end(event, size)
-            return DoubleStepTimes(-mirrored, event, end, first, second)
+            return DoubleStepTimes(-mirrored, event, end, first, second, size)
         zero, step = _decimal(origin), _decimal(size)
         pair = 2 * step
         last = zero + pair * ceil((_decimal(event) - zero) / pair)
-        return DoubleStepTimes(float(last - pair), float(last - step), float(last), size, size)
+        begin, middle, end = float(last - pair), float(last - step), float(last)
+        return DoubleStepTimes(begin, middle, end, middle - begin, end - middle, size)
+
+    def crossed(self, begin: float, crossing: DoubleStepTimes) -> DoubleStepTimes:
+        """The double step over an event as it is taken.
+
+        Args:
+            begin: where the slaves stand [s], before the event by a `crossing`'s way.
+            crossing: over the event.
+        """
+        middle, end, size = crossing.middle, crossing.end, crossing.step_size
+        return DoubleStepTimes.through(begin, middle, end, size, self.longest)
 
 
 _Size = TypeVar("_Size", int, float)
 
 
-def _planned(size: _Size, left: _Size, smallest: _Size, largest: _Size, rounding: _Size) -> _Size:
+def _planned(
+    size: _Size, left: _Size, smallest: _Size, largest: _Size, rounding: float = 0.0
+) -> _Size:
     """A size near ``size`` that leaves a rest which sizes between the bounds can fill.
 
     n sizes fill what is between n times the smallest and n times the largest. A rest in a gap
@@ -284,17 +337,16 @@ def _planned(size: _Size, left: _Size, smallest: _Size, largest: _Size, rounding
         left: to fill with this size and those that follow.
         smallest: bound of all of them.
         largest: bound of all of them.
-        rounding: by which each size may miss the bounds.
+        rounding: by which the last step was missed.
     """
-    low, high = smallest - rounding, largest + rounding
     rest = left - size
-    number = ceil(rest / high)
-    if number * low <= rest:
+    number = ceil(rest / largest)
+    if number * smallest <= rest:
         return size
-    smaller = left - number * low
-    if smaller >= low - rounding:  # the last step was rounded too
+    smaller = left - number * smallest
+    if smaller >= smallest - rounding:
         return smaller
-    return min(left, left - (number - 1) * high)
+    return min(left, left - (number - 1) * largest)
 
 
 def _can_be_filled(left: _Size, smallest: _Size, largest: _Size) -> bool:

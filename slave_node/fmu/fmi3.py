@@ -14,6 +14,7 @@ from protocol.calls import StepResult
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
 from protocol.slave import StartValue, StepStatus, VariableType
+from protocol.step_sums import step_to
 from slave_node.fmu.archive import PLATFORM_FOLDERS
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL_3, ArrayExchangeBuffer, InputPolynomials
@@ -313,30 +314,30 @@ class Fmi3Slave(FmuSlave):
     def do_step(
         self, communication_point: float, step_size: float, no_set_state_prior: bool
     ) -> StepResult:
-        """See `Slave`."""
+        """See `Slave`. An event is not stepped over, and be it a rounding before the end."""
         end = communication_point + step_size
-        time, h = communication_point, step_size
+        time = self._time if meet(self._time, communication_point) else communication_point
         for _ in range(MAX_EVENTS):
-            reached, has_event = end, self._fmi3.next_event_time <= end
-            if has_event and not meet(self._fmi3.next_event_time, end):
-                reached = max(self._fmi3.next_event_time, time)
-                h = reached - time
-            if h > 0.0:
+            target, has_event = end, self._fmi3.next_event_time <= end
+            if has_event:
+                target = max(self._fmi3.next_event_time, time)
+            reached = time
+            if target > time:
+                h = step_to(time, target, step_size)
                 result = self._step(time, h, no_set_state_prior)
                 if result.status is not _STEP_OK:
                     return result
                 has_event = self._event.value or (has_event and not self._early.value)
-                reached = self._reached.value if self._early.value else reached
-            if meet(reached, end):
-                self._time = end
+                reached = self._reached.value if self._early.value else time + h
+            self._time = reached
+            if reached >= end or meet(reached, end):
                 ends = has_event and self._has_event_mode and self._handle_event()
                 return StepResult(StepStatus.TERMINATED if ends else _STEP_OK, end)
-            self._time = reached
             if self._returns_early and not is_at_border(reached, communication_point, end):
                 return StepResult(StepStatus.EARLY_RETURN, reached)
             if has_event and self._has_event_mode and self._handle_event():
                 return StepResult(StepStatus.TERMINATED, reached)
-            time, h = reached, end - reached
+            time = reached
         raise StepRejectedError(f"more than {MAX_EVENTS} events in one step")
 
     def _step(self, time: float, h: float, no_set_state_prior: bool) -> StepResult:
@@ -354,8 +355,13 @@ class Fmi3Slave(FmuSlave):
             self._fmi3.check("fmi3DoStep", status)
         if self._end.value:
             return StepResult(StepStatus.TERMINATED, self._reached.value)
-        if self._early.value and not time <= self._reached.value <= time + h:
-            raise SlaveError(f"fmi3DoStep returned early at {self._reached.value!r} s")
+        reached, end = self._reached.value, time + h
+        is_within = time <= reached <= end or meet(reached, time) or meet(reached, end)
+        if self._early.value and not is_within:
+            raise SlaveError(
+                f"fmi3DoStep returned early at {reached!r} s, beside the step from {time!r} s to "
+                f"{end!r} s"
+            )
         return StepResult(_STEP_OK, time + h)
 
     # ---- Saved states -------------------------------------------------------------------------

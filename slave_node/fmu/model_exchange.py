@@ -59,7 +59,7 @@ class ModelExchangeSlave(FmuSlave):
         self._saves_by_fmu = model.model.interface.saves_state
         self._solver: CVode | None = None
         self._bind((), ())
-        self._start(0.0, None, early_return=False)
+        self._start(0.0, None, None, early_return=False)
 
     def _bind(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
         """Make the buffers for these inputs and outputs."""
@@ -67,8 +67,16 @@ class ModelExchangeSlave(FmuSlave):
         self._polynomials = InputPolynomials(self._inputs, self._model.buffers(inputs, sets=True))
         self._outputs = self._model.buffers(outputs, sets=False)
 
-    def _start(self, time: float, tolerance: float | None, *, early_return: bool) -> None:
+    def _start(
+        self,
+        time: float,
+        stop_time: float | None,
+        tolerance: float | None,
+        *,
+        early_return: bool,
+    ) -> None:
         self._time = self._inputs_time = self._model_time = time
+        self._stop_time = math.inf if stop_time is None else stop_time
         self._tolerance = max(tolerance or DEFAULT_TOLERANCE, MIN_TOLERANCE)
         self._returns_early = early_return
         self._is_initializing = True
@@ -97,7 +105,7 @@ class ModelExchangeSlave(FmuSlave):
         self._discrete_inputs = self._model.discrete(discrete_inputs)
         self._discrete_outputs = self._model.discrete(discrete_outputs)
         self._model.continuous_places([*inputs, *outputs])
-        self._start(start_time, relative_tolerance, early_return=early_return)
+        self._start(start_time, stop_time, relative_tolerance, early_return=early_return)
         self._model.enter_initialization_mode(
             start_time, stop_time, relative_tolerance, start_values
         )
@@ -191,7 +199,7 @@ class ModelExchangeSlave(FmuSlave):
         begin, end = communication_point, communication_point + step_size
         if not begin < end < math.inf:
             raise SlaveError(f"a step of {step_size!r} s does not advance the time {begin!r} s")
-        if not meet(begin, self._time):
+        if begin != self._time:
             raise SlaveError(f"a step from {begin!r} s, but the slave stands at {self._time!r} s")
         time = max(begin, self._model_time)
         if self._changed_domains() and self._handle_event():
@@ -206,7 +214,8 @@ class ModelExchangeSlave(FmuSlave):
             if has_event and self._returns_early and not is_at_border(time, begin, end):
                 return StepResult(StepStatus.EARLY_RETURN, time)
             if is_last and not has_event and self._returns_early:
-                has_event = self._reach_event_ahead(time, SLACK * step_size)
+                ahead = min(SLACK * step_size, self._stop_time - time)
+                has_event = ahead > 0.0 and self._reach_event_ahead(time, ahead)
             if has_event and self._handle_event():
                 return StepResult(StepStatus.TERMINATED, self._time)
             if is_last:
@@ -253,6 +262,7 @@ class ModelExchangeSlave(FmuSlave):
         assert solver is not None
         is_time_event = model.next_event_time <= stop
         if meet(time, stop):
+            self._set_point(stop, model.vector("states", self._size).ctypes.data)
             return stop, is_time_event, False
         model.transfer("states", solver.x.ctypes.data, self._size)
         nominals = model.vector("nominals", self._size) if self._size else np.ones(1)

@@ -1,6 +1,7 @@
 /* A staircase and a lag that follows it: the level (Int32, discrete) rises by 1 at every multiple
  * of 0.35 s, and x' = (level - x) / T with the exact solution. With event mode a step ends at the
- * next of these times; without, it passes over them and the level rises on the way. */
+ * next of these times; without, it passes over them and the level rises on the way. With
+ * ROUNDS_EVENTS a step that ends a rounding before an event returns early at the event. */
 #include "lag.h"
 
 #include <math.h>
@@ -44,6 +45,10 @@ static Outcome step_up(void *block, void *hidden, Step *step)
         return STEP_REFUSED;
     }
     double now = step->t;
+#ifdef ROUNDS_EVENTS
+    if (fabs(next_event(state) - step->reached) < 1e-15 * step->reached)
+        step->reached = next_event(state);
+#endif
     while (next_event(state) <= step->reached) {
         const double event = fmax(now, next_event(state));
         lag_advance(&state->lag, event - now);

@@ -52,6 +52,9 @@ fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time)
         return fmi2Error;
     if (!isfinite(time))
         return status_of(report(instance, ERROR, __func__, "the time is %g", time));
+    if (time > instance->standing.stop_time)
+        return status_of(report(instance, ERROR, __func__, "%.17g is beyond the stop time %.17g",
+                                time, instance->standing.stop_time));
     instance->standing.time = time;
     return fmi2OK;
 }

@@ -150,7 +150,7 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 currentCommunicationPoint,
         instance->standing.mode = STEP_DISCARDED; /* no further step */
     *eventHandlingNeeded = status == OK && step.event;
     *terminateSimulation = status == OK && step.terminate;
-    *earlyReturn = status == OK && step.reached < end;
+    *earlyReturn = status == OK && step.reached != end;
     *lastSuccessfulTime = instance->standing.time;
     return status_of(status);
 }

@@ -61,6 +61,9 @@ fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time)
         return fmi3Error;
     if (!isfinite(time))
         return status_of(report(instance, ERROR, __func__, "the time is %g", time));
+    if (time > instance->standing.stop_time)
+        return status_of(report(instance, ERROR, __func__, "%.17g is beyond the stop time %.17g",
+                                time, instance->standing.stop_time));
     instance->standing.time = time;
     return fmi3OK;
 }

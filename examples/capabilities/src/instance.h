@@ -103,7 +103,4 @@ Status no_saved_states(const Instance *instance, const char *function);
  * follows from a step that ends early is up to the version of FMI. */
 Status take_step(Instance *instance, const char *function, Step *step);
 
-/* The distance of `value` to the next larger number. */
-double ulp(double value);
-
 #endif
