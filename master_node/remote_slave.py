@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Sequence
+from contextlib import suppress
 
 from protocol.administration import Claim
 from protocol.bus import Bus, Caller, PendingReply
@@ -17,9 +18,9 @@ from protocol.codec import (
     encode_program,
     encode_request,
 )
-from protocol.errors import DoublestepError, SlaveLostError
+from protocol.errors import DoublestepError, SequenceError, SlaveLostError
 from protocol.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey
-from protocol.processes import has_ended
+from protocol.processes import PeerProcess
 from protocol.slave import StartValue
 
 _CLAIM_TIME = 90.0  # a slave whose worker died loads its model again first
@@ -92,8 +93,7 @@ class RemoteSlave:
         answer = decode_map(caller.request(encode_map(self._claim.to_message())))
         self._epoch = int(answer["epoch"])
         self._sequence = 0
-        self._host = str(answer.get("host", ""))
-        self._pid = int(answer.get("pid", 0))
+        self._process = PeerProcess(str(answer.get("host", "")), int(answer.get("pid", 0)))
 
     def _caller(self) -> Caller:
         return self._bus.caller(self._key.verb(EXECUTE), self._step_timeout)
@@ -111,7 +111,7 @@ class RemoteSlave:
     @property
     def has_ended(self) -> bool:
         """True when its process was on this host and is no more; False: it may live."""
-        return has_ended(self._host, self._pid)
+        return self._process.has_ended
 
     @property
     def request(self) -> str:
@@ -196,7 +196,8 @@ class RemoteSlave:
         """
         self.abort()
         caller = self._bus.caller(self._key.verb(RELEASE), _RELEASE_TIME)
-        decode_map(caller.request(encode_map({"epoch": self._epoch})))
+        with suppress(SequenceError):  # it was given back already, when we were out of reach
+            decode_map(caller.request(encode_map({"epoch": self._epoch})))
         self._take()
 
     def release(self) -> None:

@@ -32,6 +32,7 @@ from protocol.errors import (
     DeadlineError,
     DoublestepError,
     ModelError,
+    SequenceError,
     SlaveCrashedError,
     SlaveError,
     SlaveKilledError,
@@ -162,7 +163,7 @@ class RestorableSlave:
             failure: DoublestepError | None = None
             try:
                 reply = self._link.finish()
-                if isinstance(reply.error, SlaveCrashedError):
+                if isinstance(reply.error, SlaveCrashedError | SequenceError):
                     failure = reply.error
             except (SlaveLostError, DeadlineError) as error:
                 if error.slave not in ("", self.name):
@@ -234,7 +235,7 @@ class RestorableSlave:
             data = reply.results[1]
             assert isinstance(data, bytes)
             self.log.save(data)
-        elif isinstance(reply.error, SlaveLostError | SlaveCrashedError):
+        elif isinstance(reply.error, SlaveCrashedError) or _is_lost(reply.error):
             lost = reply.error.located(slave=self.name, phase="serialize_state")
             if self._restart is None:
                 raise lost
@@ -291,8 +292,11 @@ class RestorableSlave:
                     lost = self._unrestored(cause, error)
                     self._give_up(lost.cause)
                     raise lost from error
+        told = DoublestepError(cause.cause).located(
+            slave=self.name, phase=cause.phase, time=cause.time, step_size=cause.step_size
+        )
         log.warning(
-            "%s; started again and restored in %.1f s: the run goes on", cause, monotonic() - begin
+            "%s; started again and restored in %.1f s: the run goes on", told, monotonic() - begin
         )
 
     def _restored(self) -> SlaveLink:
@@ -317,9 +321,9 @@ class RestorableSlave:
             self._deserialize(link, state)
             self._replay(link, self.log.steps(state.number))
             self._replay(link, [self.log.present])
-        except (SlaveKilledError, SlaveLostError):
-            raise
-        except (_NotRestoredError, SlaveError):
+        except (_NotRestoredError, SlaveError) as error:
+            if _is_lost(error):
+                raise
             return False
         self.log.proven()
         return True
@@ -372,8 +376,10 @@ def _execute(link: SlaveLink, calls: Sequence[Call]) -> list[object]:
 
 
 def _is_lost(error: Exception) -> bool:
-    """Whether its process is gone for a reason that has nothing to do with the model."""
-    return isinstance(error, SlaveLostError | SlaveKilledError)
+    """Whether it is gone for a reason that has nothing to do with the model: its process died, or
+    it was given back while we were out of reach.
+    """
+    return isinstance(error, SlaveLostError | SlaveKilledError | SequenceError)
 
 
 def _cause(error: Exception) -> str:

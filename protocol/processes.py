@@ -20,9 +20,34 @@ def ending_signals() -> list[signal.Signals]:
     return numbers
 
 
+class PeerProcess:
+    """A process that spoke to us, and what becomes of it.
+
+    Its host may have our name and see other processes, as containers do: what is not here now is
+    never known to have ended.
+
+    Args:
+        host, pid: as it says.
+    """
+
+    def __init__(self, host: str, pid: int) -> None:
+        self._place = host, pid
+        self.is_here = is_of_this_host(host, pid) and not has_ended(host, pid)
+
+    @property
+    def has_ended(self) -> bool:
+        """True when it was here and is no more; False: it may live."""
+        return self.is_here and has_ended(*self._place)
+
+
+def is_of_this_host(host: str, pid: int) -> bool:
+    """Whether the system can be asked for a process."""
+    return host == socket.gethostname() and pid > 0 and os.name == "posix"
+
+
 def has_ended(host: str, pid: int) -> bool:
     """True when ``pid`` is a process of this host that is no more; False: it may live."""
-    if host != socket.gethostname() or pid <= 0 or os.name != "posix":
+    if not is_of_this_host(host, pid):
         return False
     try:
         os.kill(pid, 0)

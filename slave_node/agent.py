@@ -38,7 +38,7 @@ from protocol.agents import (
     lacking,
 )
 from protocol.bus import Bus
-from protocol.clock import SYSTEM_CLOCK, Timer
+from protocol.clock import SYSTEM_CLOCK
 from protocol.codec import decode_record, encode_error_map, encode_record
 from protocol.errors import (
     ConfigurationError,
@@ -54,14 +54,13 @@ from protocol.keys import (
     STOP,
     UPLOAD,
     AgentKey,
-    MasterKey,
     SlaveKey,
     alive_agents,
-    alive_master,
 )
-from protocol.processes import has_ended
+from protocol.processes import PeerProcess
 from protocol.slave_processes import SlaveProcess, end_all
 from slave_node.ending import wait_for_end
+from slave_node.master_watch import Master, MasterWatch
 from slave_node.model_store import ModelStore
 from slave_node.upload_cache import UploadCache
 
@@ -111,11 +110,8 @@ class Surroundings:
 class _Run:
     """What was started for a run."""
 
-    request: StartSlave
     slaves: dict[str, tuple[StartSlave, SlaveProcess]] = field(default_factory=dict)
-    changes: int = 0
     ending: bool = False
-    look: Timer | None = None
 
 
 _R = TypeVar("_R", bound=Record)
@@ -137,6 +133,7 @@ class Agent:
         self._offer = offer
         self._surroundings = surroundings
         self._runs: dict[str, _Run] = {}
+        self._masters = MasterWatch(bus, SYSTEM_CLOCK, self._end_orphans)
         self._lock = threading.RLock()
         self._closed = False
         self._since = time.time()
@@ -161,7 +158,7 @@ class Agent:
         self._serve_record(START, StartSlave, self.start)
         self._serve_record(STOP, StopRun, self.stop)
         self._serve_record(OUTPUT, OutputRequest, self.output)
-        self._bus.watch(alive_master("*"), self._master_changed)
+        self._masters.start()
         self._bus.announce(self._key.alive)
         log.info("ready: agent with %d models, instance %s", len(models), self._key.instance)
         try:
@@ -269,7 +266,7 @@ class Agent:
 
     def _start(self, request: StartSlave, base: Path, model: str) -> SlaveProcess:
         """Start a slave, in place of the one before if it is to be started again."""
-        run = self._runs.get(request.run) or _Run(request)
+        run = self._runs.get(request.run) or _Run()
         before = run.slaves.get(request.slave)
         is_other = before is not None and before[0].restart >= request.restart
         if run.ending or is_other:
@@ -288,7 +285,10 @@ class Agent:
             request.run,
             extra={"run": request.run, "slave": request.slave},
         )
-        self._look_after(request.run, request.orphan_time)  # its master may be gone already
+        process_of_master = PeerProcess(request.host, request.pid)
+        self._masters.follow(
+            request.run, Master(request.run, process_of_master, request.orphan_time)
+        )
         return process
 
     def stop(self, request: StopRun) -> Done:
@@ -402,43 +402,7 @@ class Agent:
             model, base, key, connection=places.connection, log=log_file, scratch=scratch
         )
 
-    def _master_changed(self, key: str, alive: bool) -> None:
-        master = MasterKey.from_alive(key)
-        if master is None:
-            return
-        with self._lock:
-            run = self._runs.get(master.run)
-            if run is None:
-                return
-            run.changes += 1
-            request = run.request
-        if alive:
-            return
-        log.warning("the master of run %s is gone", master.run, extra={"run": master.run})
-        ended = has_ended(request.host, request.pid)
-        self._look_after(master.run, 0.0 if ended else request.orphan_time)
-
-    def _look_after(self, run: str, wait: float) -> None:
-        """See after ``wait`` seconds whether the master of ``run`` is there; only the last look."""
-        with self._lock:
-            known = self._runs.get(run)
-            if known is None:
-                return
-            if known.look is not None:
-                known.look.cancel()
-            changes = known.changes
-            known.look = SYSTEM_CLOCK.later(wait, lambda: self._end_orphans(run, changes))
-
-    def _end_orphans(self, run: str, changes: int) -> None:
-        with self._lock:
-            known = self._runs.get(run)
-        if known is None or known.changes != changes:
-            return  # it came meanwhile; if it went again, that is waited for anew
-        try:
-            if self._bus.alive(alive_master(run), _PEER_TIME):
-                return
-        except SlaveLostError:  # the bus is closed: the agent is ending
-            return
+    def _end_orphans(self, run: str) -> None:
         log.warning("run %s has no master any more: ending its slaves", run, extra={"run": run})
         self._end(run)
 
@@ -448,8 +412,7 @@ class Agent:
             if known is None:
                 return
             known.ending = True
-            if known.look is not None:
-                known.look.cancel()
+            self._masters.forget(run)
         processes = [process for _, process in known.slaves.values()]
         end_all(processes)
         with self._lock:

@@ -1,16 +1,19 @@
 """Who holds the slave, and the guard that lets every request take effect exactly once.
 
-A master claims a slave for its run and gets an epoch; each request carries the epoch and a
-sequence number that grows by one. A repeated number gets the reply that was stored, without a
-second effect; an old epoch is refused. Pure state: no clock, no bus.
+A master claims a slave for its run and gets an epoch, a number that nobody can guess; each request
+carries the epoch and a sequence number that grows by one. A repeated number gets the reply that was
+stored, without a second effect; an old epoch is refused. No clock, no bus.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from secrets import randbelow
 
 from protocol.administration import DEFAULT_ORPHAN_TIME
 from protocol.errors import SequenceError, SlaveBusyError
+
+_EPOCHS = 2**62
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +55,7 @@ class Claims:
 
     @property
     def epoch(self) -> int:
-        """The present epoch; it grows with each claim."""
+        """The present epoch: drawn anew for each claim; 0 before the first."""
         return self._epoch
 
     def claim(self, holder: Holder) -> int:
@@ -69,7 +72,7 @@ class Claims:
                 remedy="wait for that run to end, or start another slave under another name",
             )
         self._holder = holder
-        self._epoch += 1
+        self._epoch = 1 + randbelow(_EPOCHS)
         self._sequence = 0
         self._reply = b""
         return self._epoch
@@ -83,8 +86,9 @@ class Claims:
         if self._holder is None or epoch != self._epoch:
             held = f"held by {self._holder}" if self._holder else "held by nobody"
             raise SequenceError(
-                f"the request has epoch {epoch}, the present one is {self._epoch} ({held})",
-                remedy="the slave was released or claimed again meanwhile: start the run again",
+                f"the request has epoch {epoch}, which is not the present one ({held}): the slave "
+                "was given back, as its master was out of reach, or claimed again",
+                remedy="start the run again",
             )
 
     def release(self, epoch: int) -> None:

@@ -16,7 +16,7 @@ from datetime import datetime
 from protocol.administration import DEFAULT_ORPHAN_TIME, Claim, SlaveStatus
 from protocol.bus import Bus
 from protocol.calls import CALLS, Call, Reply, Reset
-from protocol.clock import SYSTEM_CLOCK, Clock, Timer
+from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.codec import (
     PROTOCOL_VERSION,
     decode_map,
@@ -36,7 +36,6 @@ from protocol.errors import (
     SequenceError,
     SlaveBusyError,
     SlaveCrashedError,
-    SlaveLostError,
 )
 from protocol.keys import (
     ABORT,
@@ -45,12 +44,12 @@ from protocol.keys import (
     RELEASE,
     STATUS,
     SlaveKey,
-    alive_master,
     alive_slaves,
 )
-from protocol.processes import has_ended
+from protocol.processes import PeerProcess
 from protocol.slave import SlaveDescription, StartValue
 from slave_node.claims import Claims, Holder
+from slave_node.master_watch import Master, MasterWatch
 from slave_node.worker import Worker
 
 log = logging.getLogger("slave_node")
@@ -87,11 +86,8 @@ class SlaveNode:
         self._description = description
         self._orphan_time = orphan_time
         self._claims = Claims()
-        self._changes_of_master = 0
-        self._clock = clock
+        self._masters = MasterWatch(bus, clock, self._free_orphan)
         self._running = clock.lock()
-        self._looking = clock.lock()
-        self._look: Timer | None = None
         self._worker_alive = True
         self._since = time.time()
 
@@ -114,7 +110,7 @@ class SlaveNode:
         self._bus.serve(key.verb(RELEASE), self._release)
         for call in CALLS:
             self._bus.serve(key.verb(call.verb), self._single(call))
-        self._bus.watch(alive_master("*"), self._master_changed)
+        self._masters.start()
         self._bus.serve_here(key.verb(EXECUTE), self._execute, self._announce)
 
     def _others(self) -> list[str]:
@@ -202,7 +198,8 @@ class SlaveNode:
                 epoch = self._claims.claim(holder)
             if new:
                 log.info("claimed by %s", holder, extra=_about(holder))
-                self._look_after(epoch, holder.orphan_time)  # a claim may arrive after its run
+                process = PeerProcess(holder.host, holder.pid)
+                self._masters.follow(epoch, Master(holder.run, process, holder.orphan_time))
         except DoublestepError as error:
             log.warning("claim refused: %s", error)
             return encode_error_map(error.located(slave=self._key.name, phase=CLAIM))
@@ -218,6 +215,7 @@ class SlaveNode:
             with self._running:
                 holder = self._claims.holder
                 self._claims.release(epoch)
+                self._masters.forget(epoch)
                 log.info("released by %s", holder, extra=_about(holder))
                 self._reset()
         except DoublestepError as error:
@@ -265,37 +263,10 @@ class SlaveNode:
         )
         return encode_map(status.to_message())
 
-    def _master_changed(self, key: str, alive: bool) -> None:
-        holder = self._claims.holder
-        if holder is None or key != alive_master(holder.run):
-            return
-        self._changes_of_master += 1
-        if alive:
-            log.info("the master is there: %s", holder, extra=_about(holder))
-            return
-        log.warning("the master is gone: %s", holder, extra=_about(holder))
-        ended = has_ended(holder.host, holder.pid)
-        self._look_after(self._claims.epoch, 0.0 if ended else holder.orphan_time)
-
-    def _look_after(self, epoch: int, wait: float) -> None:
-        """See after ``wait`` seconds whether the master of ``epoch`` is there.
-
-        One look is enough, the last: claims without number must not make timers without number.
-        """
-        with self._looking:
-            if self._look is not None:
-                self._look.cancel()
-            changes = self._changes_of_master
-            self._look = self._clock.later(wait, lambda: self._reset_orphan(epoch, changes))
-
-    def _reset_orphan(self, epoch: int, changes: int) -> None:
+    def _free_orphan(self, epoch: int) -> None:
         """Give a slave back whose master is gone; a step under way is for nobody any more."""
-        if changes != self._changes_of_master:
-            return  # it came meanwhile; if it went again, that is waited for anew
         holder = self._claims.holder
         try:
-            if holder is None or self._bus.alive(alive_master(holder.run), _PEER_TIME):
-                return
             self._claims.check(epoch)
             if self.busy:
                 self._end_worker("its master is gone")
@@ -303,8 +274,8 @@ class SlaveNode:
                 self._claims.release(epoch)
                 log.warning("reset; free for another master", extra=_about(holder))
                 self._reset()
-        except (SequenceError, SlaveLostError) as error:
-            log.info("not reset: %s", error)  # released meanwhile, or the node is ending
+        except SequenceError as error:
+            log.info("not reset: %s", error)  # released meanwhile
 
 
 def _capabilities(description: SlaveDescription) -> str:

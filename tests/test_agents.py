@@ -12,6 +12,8 @@ import re
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 import zipfile
@@ -684,8 +686,10 @@ def test_slaves_of_a_master_that_is_gone_are_ended(models: Path, serve_agent: Se
     served.bus.withdraw(key.alive)
     wait_until(lambda: served.agent.status().slaves == ())
     served.bus.announce(MasterKey("dead").alive)
-    served.ask(START, request(run="dead", pid=2**22 + 1), SlaveStarted)  # no such process
-    served.bus.withdraw(MasterKey("dead").alive)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        served.ask(START, request(run="dead", pid=process.pid), SlaveStarted)
+        served.bus.withdraw(MasterKey("dead").alive)  # as connections close before it is dead
+        process.kill()
     wait_until(lambda: served.agent.status().slaves == ())
 
 

@@ -100,7 +100,7 @@ def test_a_stale_reply_that_is_given_out_is_found(monkeypatch: pytest.MonkeyPatc
 
 def test_a_slave_that_keeps_a_vanished_master_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """Never free again: no other master could use it."""
-    monkeypatch.setattr(SlaveNode, "_reset_orphan", lambda *_: None)
+    monkeypatch.setattr(SlaveNode, "_free_orphan", lambda *_: None)
     assert "is never free again" in str(find())
 
 

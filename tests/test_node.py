@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import socket
 import subprocess
@@ -18,6 +19,9 @@ import msgpack
 import psutil
 import pytest
 
+from master_node.remote_slave import RemoteSlave
+from master_node.restorable_slave import RestorableSlave
+from master_node.slaves import describe
 from protocol.administration import MAX_ORPHAN_TIME, Claim
 from protocol.bus import Bus, InProcessBus
 from protocol.calls import (
@@ -49,6 +53,7 @@ from protocol.errors import (
     SlaveBusyError,
     SlaveCrashedError,
     SlaveKilledError,
+    SlaveLostError,
     VersionError,
 )
 from protocol.keys import (
@@ -363,13 +368,13 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 def test_a_slave_is_claimed_driven_and_given_back(serve: Serve) -> None:
-    """The whole way; the next master finds the slave as good as new, under a later epoch."""
+    """The whole way; the next master finds the slave as good as new, under another epoch."""
     served = serve(parameters={"rate": 2.0})
     first = served.master().claim().start()
     assert value(first.execute(DoStep(0.0, 0.5), GetOutputs())) == pytest.approx(1.0)
     first.release()
     second = served.master("run-2").claim()
-    assert second.epoch > first.epoch
+    assert second.epoch != first.epoch
     second.start(rate=3.0)
     assert value(second.execute(DoStep(0.0, 0.5), GetOutputs())) == pytest.approx(1.5)
     assert isinstance(second.execute(Describe()).results[0], SlaveDescription)
@@ -512,7 +517,7 @@ def test_a_crash_of_the_model_is_an_answer(serve: Serve, what: str, words: str) 
     assert time.perf_counter() - begin < 2.0
     assert type(crashed.error) is SlaveCrashedError
     assert words in str(crashed.error)
-    assert type(first.execute(GetOutputs()).error) is SlaveCrashedError
+    assert type(first.execute(GetOutputs()).error) is SlaveKilledError
     assert first.status()["worker"] == "dead"
     first.release()
 
@@ -650,11 +655,12 @@ def test_what_a_model_has_started_ends_with_it(end: str, tmp_path: Path) -> None
 
 
 @pytest.fixture
-def dead_pid() -> int:
-    """The number of a process that has ended."""
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait(BOUND)
-    return process.pid
+def mortal() -> Iterator[subprocess.Popen[bytes]]:
+    """A process for a master."""
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    yield process
+    process.kill()
+    process.communicate()
 
 
 def vanishing(served: Served, run: str, **place: Any) -> tuple[Master, Callable[[], None]]:
@@ -671,14 +677,19 @@ def vanishing(served: Served, run: str, **place: Any) -> tuple[Master, Callable[
 
 
 @over_zenoh
-def test_a_slave_of_a_dead_master_is_free_at_once(serve: Serve, dead_pid: int) -> None:
+@pytest.mark.parametrize("dies", ["before its token goes", "after that"])
+def test_a_slave_of_a_dead_master_is_free_at_once(
+    serve: Serve, mortal: subprocess.Popen[bytes], dies: str
+) -> None:
     """Same host, dead process: there is nothing to wait for; the old epoch is worth nothing."""
     served = serve(orphan_time=1000.0)
-    master, vanish = vanishing(served, "run-1", pid=dead_pid)
+    master, vanish = vanishing(served, "run-1", pid=mortal.pid)
     master.start()
     other = served.master("run-2")
+    for act in (mortal.kill, vanish) if dies == "before its token goes" else (vanish, mortal.kill):
+        act()
+    mortal.wait(BOUND)
     begin = time.perf_counter()
-    vanish()
     wait_until(lambda: other.status()["state"] == "free")
     assert time.perf_counter() - begin < 2.0
     late = Master(served.bus, "run-1", epoch=master.epoch, sequence=master.sequence)
@@ -728,14 +739,58 @@ def test_a_master_that_came_back_is_waited_for_anew(serve: Serve) -> None:
     wait_until(lambda: master.status()["state"] == "free")
 
 
+@in_process
+@pytest.mark.parametrize("holder", ["", "run-2"])
+def test_a_master_whose_slave_was_given_back_takes_it_again(
+    serve: Serve, holder: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It was out of reach for longer than the slave waits: claimed and restored, the same values.
+
+    Where another run holds the slave meanwhile, that is the end, with its name.
+    """
+    served = serve()
+    remote = RemoteSlave(served.bus, KEY, run="run-1", step_timeout=BOUND, reconnect_time=1.0)
+
+    def restart() -> RemoteSlave:
+        remote.renew()
+        return remote
+
+    slave = RestorableSlave("slave", remote, describe({"slave": remote})["slave"], restart)
+
+    def execute(*calls: Call) -> Reply:
+        slave.start(calls)
+        return slave.finish()
+
+    execute(Initialize(outputs=("x",)), ExitInitializationMode())
+    assert value(execute(DoStep(0.0, 0.5), GetOutputs())) == pytest.approx(0.5)
+    slave.settle()
+    Master(served.bus, "run-1", epoch=remote._epoch).release()
+    if holder:
+        served.master(holder, host="elsewhere", pid=1).claim()
+        with pytest.raises(SlaveLostError, match=r"which is not the present.*busy: held by run ru"):
+            execute(DoStep(0.5, 0.5), GetOutputs())
+        return
+    assert value(execute(DoStep(0.5, 0.5), GetOutputs())) == pytest.approx(1.0)
+    assert slave.restarts == 1
+    (told,) = [r.getMessage() for r in caplog.records if r.name == "master_node"]
+    assert re.match(r"slave: do_step at t=0.5 s, H=0.5 s: .* was given back.*; started again", told)
+    remote.release()
+
+
 @over_zenoh
 def test_a_dead_master_frees_a_slave_in_an_endless_step(
-    serve: Serve, background: Background, begun: Pipe, go: Path, dead_pid: int
+    serve: Serve,
+    background: Background,
+    begun: Pipe,
+    go: Path,
+    mortal: subprocess.Popen[bytes],
 ) -> None:
     """Nobody waits for that step any more: it is ended, and the slave is free."""
     served = serve("Slow", parameters={"begun": str(begun.path), "go": str(go)})
-    master, vanish = vanishing(served, "run-1", pid=dead_pid)
+    master, vanish = vanishing(served, "run-1", pid=mortal.pid)
     master.start()
+    mortal.kill()
+    mortal.wait(BOUND)
     outcome = background(lambda: master.execute(DoStep(0.0, 0.5)))
     begun.wait()
     vanish()
