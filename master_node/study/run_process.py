@@ -106,6 +106,7 @@ class RunProcess:
                 self.finish(monotonic() + _LATE_TIME)
             else:
                 return None
+        self.interrupt()  # it has ended: its standard input is of no more use
         record = self._record(self._process.returncode)
         self._scratch.cleanup()
         try:
