@@ -7,11 +7,15 @@ import os
 # Threads only get in each other's way on matrices of a few rows. Read where NumPy is imported.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
+import hashlib
 import importlib.util
+import shlex
 import shutil
 import socket
+import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
+from importlib import metadata
 from pathlib import Path
 from secrets import token_hex
 from types import ModuleType
@@ -22,8 +26,13 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from tests.signal_dispositions import default_dispositions
+from tests.waiting import BOUND, slowdown
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+
+# Hundreds of processes are started, and each of them would compile the sources again.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # A slow moment of the machine is no counterexample.
 settings.register_profile(
@@ -36,13 +45,6 @@ settings.load_profile("doublestep")
 
 _MARK = "DOUBLESTEP_TEST_SESSION"
 _TIME_TO_END = 3.0
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One test at a time starts processes: workers share the machine, and its time."""
-    for item in items:
-        if "no_process_left" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.xdist_group("processes"))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -64,6 +66,49 @@ def _example(folder: str, script: str) -> ModuleType:
     return module
 
 
+Built = Callable[[str], Path]
+
+
+@pytest.fixture(scope="session")
+def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """``built("oscillators")`` is a folder with the FMUs of this example, for this worker alone.
+
+    They are compiled once for all workers, and kept for later sessions under a digest of what they
+    are made from.
+    """
+    store = request.config.cache.mkdir("fmus") / fmu_sources_digest()
+
+    def copy(example: str) -> Path:
+        folder = tmp_path_factory.mktemp(example) / example
+        kept, script = store / example, _example(example, "build")
+        with FileLock(store.with_name("lock")):
+            for other in store.parent.iterdir():
+                if other.is_dir() and other != store:
+                    shutil.rmtree(other)
+            if not kept.exists():
+                script.build(folder)
+                shutil.copytree(folder, kept.with_suffix(".part"), dirs_exist_ok=True)
+                kept.with_suffix(".part").rename(kept)
+                return folder
+        return Path(shutil.copytree(kept, folder, copy_function=shutil.copy))
+
+    return copy
+
+
+def fmu_sources_digest() -> str:
+    """A digest of all that FMUs of the examples are made from: sources, headers, the compiler."""
+    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or "clang"
+    version = subprocess.run(
+        [*shlex.split(compiler), "--version"], capture_output=True, timeout=BOUND, check=False
+    ).stdout
+    digest = hashlib.sha256(f"{compiler} {metadata.version('fmpy')} ".encode() + version)
+    for path in sorted(EXAMPLES.rglob("*")):
+        if path.suffix in {".c", ".h", ".py", ".xml"}:
+            content = path.read_bytes()
+            digest.update(f"{path.relative_to(EXAMPLES)} {len(content)} ".encode() + content)
+    return digest.hexdigest()[:16]
+
+
 @pytest.fixture(scope="session")
 def build_script() -> ModuleType:
     """The script that builds the FMUs of the quarter car."""
@@ -71,19 +116,15 @@ def build_script() -> ModuleType:
 
 
 @pytest.fixture(scope="session")
-def fmu_dir(build_script: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fmu_dir(built: Built) -> Path:
     """The folder with the four FMUs of the quarter car."""
-    folder = tmp_path_factory.mktemp("quarter_car")
-    build_script.build(folder)
-    return folder
+    return built("quarter_car")
 
 
 @pytest.fixture(scope="session")
-def oscillator_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def oscillator_dir(built: Built) -> Path:
     """The folder with the three FMUs of the oscillators."""
-    folder = tmp_path_factory.mktemp("oscillators")
-    _example("oscillators", "build").build(folder)
-    return folder
+    return built("oscillators")
 
 
 @pytest.fixture(scope="session")
@@ -94,15 +135,9 @@ def quarter_car_ssp(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def capability_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with the FMUs of all capabilities: one, also for several workers."""
-    folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        folder = folder.parent
-    folder /= "capabilities"
-    with FileLock(f"{folder}.lock"):
-        _example("capabilities", "build").build(folder)
-    return folder
+def capability_dir(built: Built) -> Path:
+    """The folder with the FMUs of all capabilities."""
+    return built("capabilities")
 
 
 @pytest.fixture(scope="session")
@@ -145,12 +180,12 @@ def endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-Survivors = Callable[[], list[psutil.Process]]
+Survivors = Callable[..., list[psutil.Process]]
 
 
 @pytest.fixture(scope="session", autouse=True)
 def survivors() -> Iterator[Survivors]:
-    """The processes that tests started and that do not end in a bounded time.
+    """The processes that tests started and that do not end in a bounded time, but for those known.
 
     A mark in the environment finds them even when they lost their parent. Asked once more at the
     end of the session: nothing that a test started may outlive it.
@@ -158,9 +193,11 @@ def survivors() -> Iterator[Survivors]:
     mark = token_hex(8)
     os.environ[_MARK] = mark
 
-    def find() -> list[psutil.Process]:
-        marked = [process for process in psutil.process_iter() if _is_marked(process, mark)]
+    def find(known: Collection[psutil.Process] = ()) -> list[psutil.Process]:
+        marked = [p for p in psutil.process_iter() if p not in known and _is_marked(p, mark)]
         _, alive = psutil.wait_procs(marked, timeout=_TIME_TO_END)
+        if alive:
+            _, alive = psutil.wait_procs(alive, timeout=_TIME_TO_END * slowdown())
         return alive
 
     yield find
@@ -184,8 +221,9 @@ def _is_marked(process: psutil.Process, mark: str) -> bool:
 @pytest.fixture
 def no_process_left(survivors: Survivors) -> Iterator[None]:
     """Fails the test after which a process that it started goes on."""
+    known = set(psutil.process_iter())
     yield
-    left = survivors()
+    left = survivors(known)
     for process in left:
         process.kill()
     assert not left, f"processes are left running: {left}"

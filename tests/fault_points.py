@@ -28,11 +28,11 @@ import psutil
 from master_node import Result, System, load_system, resume, simulate
 from protocol.endpoints import free_endpoint
 from tests.test_processes import system_file, worker_of
+from tests.waiting import BOUND
 
 NUMBER = 50
 """How many points there are."""
 
-_BOUND = 60.0
 _EARLIEST, _LATEST = 60, 190  # after the first checkpoint, and of 200 attempts at least
 _SIMULATION = "stop_time = 0.4\nlargest_step_size = 1e-3\ncheckpoint_interval = 0.01\n"
 _SLAVES = ("chassis", "wheel")
@@ -116,7 +116,7 @@ class Router:
     def close(self) -> None:
         """End it."""
         self._process.kill()
-        self._process.wait(_BOUND)
+        self._process.wait(BOUND)
 
 
 @contextmanager
@@ -162,7 +162,7 @@ class _Trigger:
     def check(self) -> None:
         """That it has happened."""
         assert self.thread is not None, f"the run has only {self.attempts} attempts"
-        self.thread.join(_BOUND)
+        self.thread.join(BOUND)
         if self.errors:
             raise self.errors[0]
 
@@ -183,7 +183,7 @@ def run_point(number: int, models: Path, folder: Path, router: Router) -> Point:
     """
     point = Point.of(number)
     through = _system(models, point.settings, folder).with_bus(
-        mode="client", connect=(router.endpoint,), discovery_timeout=_BOUND
+        mode="client", connect=(router.endpoint,), discovery_timeout=BOUND
     )
     try:
         if point.fault.part == "master":
@@ -247,7 +247,7 @@ def _killed_and_resumed(point: Point, system: System, out: Path) -> None:
         nodes |= {node.pid: node for node in _nodes(psutil.Process(master.pid)).values()}
         master.join(0.01)
     assert master.exitcode == -signal.SIGKILL
-    _, alive = psutil.wait_procs(nodes.values(), timeout=_BOUND)
+    _, alive = psutil.wait_procs(nodes.values(), timeout=BOUND)
     assert not alive, "a slave outlives its master"
     resume(out)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from time import sleep
+from time import monotonic, sleep
 from typing import Any
 
 from protocol.slave import Variable, VariableType
@@ -13,6 +13,9 @@ from slave_node.model_loading import load_model_class
 _EXAMPLES = Path(__file__).parents[1] / "examples" / "quarter_car"
 _Chassis: Any = load_model_class("quarter_car.py:Chassis", _EXAMPLES)
 _Wheel: Any = load_model_class("quarter_car.py:Wheel", _EXAMPLES)
+
+_PATIENCE = 600.0
+"""No model waits longer for a test [s]."""
 
 RAMP_TIME = 0.5
 RAMP_POWER = 5
@@ -92,6 +95,36 @@ class Napper(Sleeper):
         if self.bed and Path(self.bed).exists():
             return list(_Chassis.derivatives(self, t, x, u))
         return super().derivatives(t, x, u)
+
+
+class Gated(_Chassis):
+    """A chassis that stops at each of its ``gates``, such as "0.03, 0.06", until a test opens it.
+
+    A file in ``folder`` tells that the model is there, another one that it may go on.
+    """
+
+    parameters = (
+        *_Chassis.parameters,
+        Variable("gates", type=VariableType.STRING, start=""),
+        Variable("folder", type=VariableType.STRING, start=""),
+    )
+
+    def prepare(self) -> None:
+        """All gates are ahead."""
+        super().prepare()
+        self._ahead = list(enumerate(map(float, self.gates.split(","))))
+
+    def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
+        """The chassis' equations, behind the gate."""
+        while self._ahead and t >= self._ahead[0][1]:
+            number, _ = self._ahead.pop(0)
+            Path(self.folder, f"at gate {number}").touch()
+            end = monotonic() + _PATIENCE
+            while not Path(self.folder, f"gate {number} is open").exists():
+                if monotonic() > end:
+                    raise TimeoutError("the gate stays closed")
+                sleep(0.005)
+        return list(super().derivatives(t, x, u))
 
 
 class Filter(Model):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from time import monotonic, sleep
 
 import numpy as np
 
@@ -16,8 +15,6 @@ from protocol.slave import Slave
 from slave_node.loading import load_slave
 
 MODELS = Path(__file__).parent / "state_models.py"
-BOUND = 30.0
-"""No wait in these tests is longer [s]."""
 
 
 @contextmanager
@@ -110,11 +107,3 @@ def wander(slave: Slave, seed: int, steps: int) -> list[bytes]:
     for state, _ in saved:
         slave.free_state(state)
     return seen
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    """Fails if it does not come true in a bounded time."""
-    end = monotonic() + BOUND
-    while not condition():
-        assert monotonic() < end, "waited in vain"
-        sleep(0.01)

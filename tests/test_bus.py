@@ -14,9 +14,7 @@ from protocol.bus import Bus, InProcessBus
 from protocol.endpoints import Endpoints, host_of
 from protocol.errors import ConfigurationError, DeadlineError, DoublestepError, SlaveLostError
 from protocol.zenoh_bus import ZenohBus
-
-BOUND = 10.0
-"""No wait in these tests is longer [s]."""
+from tests.waiting import BOUND, is_quick
 
 
 @dataclass
@@ -155,7 +153,7 @@ def test_nobody_serves(network: Network) -> None:
     pending = network.client.caller("a/nobody", BOUND).send(b"")
     with pytest.raises(SlaveLostError):
         pending.result()
-    assert time.perf_counter() - begin < 1.0
+    assert is_quick(time.perf_counter() - begin, 1.0)
 
 
 def test_a_server_that_left_is_nobody(network: Network) -> None:
@@ -186,7 +184,9 @@ def test_a_late_reply_is_a_deadline(zenoh_network: Network) -> None:
     begin = time.perf_counter()
     with pytest.raises(DeadlineError, match=r"no reply within 0\.2 s"):
         zenoh_network.client.caller("a/slow", 0.2).request(b"slow")
-    assert 0.15 < time.perf_counter() - begin < 1.0
+    taken = time.perf_counter() - begin
+    assert taken > 0.15
+    assert is_quick(taken, 1.0)
     assert not worked.is_set()
     gate.set()
     assert worked.wait(BOUND)
@@ -222,7 +222,7 @@ def test_cancel_ends_every_wait(zenoh_network: Network) -> None:
     canceller.join(BOUND)
     with pytest.raises(SlaveLostError):
         caller.request(b"4")
-    assert time.perf_counter() - begin < 1.0
+    assert is_quick(time.perf_counter() - begin, 1.0)
     gate.set()
     assert spared.result() == b"3"
 
@@ -307,7 +307,7 @@ def test_who_came_first_does_not_matter(endpoint: str) -> None:
         begin = time.perf_counter()
         client.watch("a/*/alive", lambda *_: seen.set())
         assert seen.wait(BOUND)
-        assert time.perf_counter() - begin < 2.0
+        assert is_quick(time.perf_counter() - begin, 2.0)
         assert client.caller("a/early", BOUND).request(b"x") == b"x"
     finally:
         server.close()
@@ -340,7 +340,7 @@ def test_closing_twice_is_closing(network: Network) -> None:
         thread.join(BOUND)
     network.server.close()
     network.client.close()
-    assert time.perf_counter() - begin < 2.0
+    assert is_quick(time.perf_counter() - begin, 2.0)
 
 
 def test_a_closed_bus_raises_errors_of_ours(network: Network) -> None:

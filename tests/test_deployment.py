@@ -13,7 +13,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,10 +25,9 @@ from typer.main import get_command
 import master_node.cli
 import slave_node.cli
 from master_node import Result, load_system, simulate
+from tests.waiting import BOUND, wait_until
 
 ROOT = Path(__file__).parents[1]
-BOUND = 60.0
-"""No wait in these tests is longer [s]."""
 
 APPS = {"master-node": master_node.cli.app, "slave-node": slave_node.cli.app}
 MANIFESTS = sorted((ROOT / "deploy" / "kubernetes").glob("*.yaml"))
@@ -219,10 +217,12 @@ class Processes:
 
     def wait_healthy(self, command: Sequence[str]) -> None:
         """Ask for the health until it is there."""
-        end = time.monotonic() + BOUND
-        while self.run(command) != 0:
-            assert time.monotonic() < end
+
+        def is_healthy() -> bool:
             assert all(process.poll() is None for process in self._started)
+            return self.run(command) == 0
+
+        wait_until(is_healthy)
 
     def close(self) -> None:
         """End all, as a stop of the containers would; each must obey."""
@@ -268,7 +268,10 @@ def container_of_pod(name: str) -> tuple[list[str], list[str]]:
 
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
 @pytest.mark.usefixtures("no_process_left")
-@pytest.mark.parametrize("containers", [containers_of_compose, containers_of_kubernetes])
+@pytest.mark.parametrize(
+    "containers",
+    [containers_of_compose, pytest.param(containers_of_kubernetes, marks=pytest.mark.slow)],
+)
 def test_the_commands_of_the_containers_simulate_the_quarter_car(
     processes: Processes, tmp_path: Path, containers: Any
 ) -> None:
@@ -307,7 +310,9 @@ def agent_of_kubernetes() -> tuple[list[str], list[str]]:
 
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
 @pytest.mark.usefixtures("no_process_left")
-@pytest.mark.parametrize("agent", [agent_of_compose, agent_of_kubernetes])
+@pytest.mark.parametrize(
+    "agent", [pytest.param(agent_of_compose, marks=pytest.mark.slow), agent_of_kubernetes]
+)
 def test_the_agent_of_the_containers_starts_slaves(
     processes: Processes, tmp_path: Path, agent: Any
 ) -> None:

@@ -13,8 +13,6 @@ from master_node import Result, System, load_system, simulate
 from protocol.errors import ConfigurationError, SlaveError
 from tests.conftest import EXAMPLES
 
-pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
-
 
 def clock_and_device(folder: Path, **simulation: Any) -> System:
     """The system of the example, with the FMUs in ``folder``."""

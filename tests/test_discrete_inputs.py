@@ -19,8 +19,6 @@ from protocol.errors import ConfigurationError, SlaveError
 from protocol.slave import Causality, StartValue, StateKind, Variable, VariableType
 from tests.quarter_car_case import ALL, LinearSlave, LinearSystem, Run, run_slaves
 
-pytestmark = pytest.mark.timeout(300)  # the first one may pay for the build of the FMUs
-
 STOP = 2.0
 KINDS = ["mod", "rich", "none", "no rollback"]
 SLOPES = replace(ALL, max_output_derivative_order=1)

@@ -11,11 +11,11 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Iterator
 from dataclasses import fields
 from fractions import Fraction
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -62,10 +62,9 @@ from protocol.slave import Capabilities, SlaveDescription, Variable
 from slave_node.metrics import CountingWorker
 from slave_node.snapshots import LIMIT
 from tests.light_slaves import LightWorker
+from tests.waiting import BOUND, wait_until
 
 ROOT = Path(__file__).parents[1]
-BOUND = 30.0
-"""No wait in these tests is longer [s]."""
 
 DOCUMENTS = sorted(
     path
@@ -173,8 +172,8 @@ def check_python(arguments: list[str]) -> list[str]:
         case ["-m", "benchmarks.reproduction", *parts]:
             assert set(parts) <= {"paper", "beyond"}
             return []
-        case ["-m", "pytest", file, *_]:
-            return [file]
+        case ["-m", "pytest", *words]:
+            return [word for word in words if word.startswith("tests/")]
         case ["ten_lines.py"]:
             return ["examples/quarter_car/ten_lines.py"]
         case [file, *_]:
@@ -359,11 +358,8 @@ def test_a_slave_is_driven_by_hand_as_the_protocol_says(
 
 def wait_for(word: str, log: Path, process: subprocess.Popen[bytes]) -> None:
     """Wait until a process has said a word."""
-    deadline = time.monotonic() + BOUND
-    while word not in log.read_text():
-        assert process.poll() is None, log.read_text()
-        assert time.monotonic() < deadline, log.read_text()
-        time.sleep(0.02)
+    wait_until(lambda: word in log.read_text() or process.poll() is not None, log.read_text)
+    assert process.poll() is None, log.read_text()
 
 
 def check_motion(output: str) -> None:
@@ -662,9 +658,14 @@ def check_tests(what: str, proofs: str) -> None:
     assert named, f"no test for: {what}"
     assert proofs.count("`") == 2 * len(named), f"not a test: {proofs}"
     for file, test in named:
-        tree = ast.parse(read(file))
-        tests = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
-        assert test in tests, f"{file} has no {test}"
+        assert test in functions_of(file), f"{file} has no {test}"
+
+
+@cache
+def functions_of(file: str) -> frozenset[str]:
+    """The names of a file's functions."""
+    tree = ast.parse(read(file))
+    return frozenset(node.name for node in tree.body if isinstance(node, ast.FunctionDef))
 
 
 # --- examples -----------------------------------------------------------------------------------

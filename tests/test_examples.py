@@ -19,10 +19,7 @@ from slave_node.loading import describe_model
 from tests.conftest import EXAMPLES
 from tests.quarter_car_case import exact_solution, global_errors
 
-pytestmark = [
-    pytest.mark.timeout(300),  # the first one pays for the build of the FMUs
-    pytest.mark.usefixtures("no_process_left"),
-]
+pytestmark = pytest.mark.usefixtures("no_process_left")
 
 
 @pytest.fixture

@@ -24,8 +24,6 @@ from slave_node.loading import load_slave
 
 Load = Callable[..., Slave]
 
-pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
-
 CONTINUOUS = {"chassis": ("x_w", "v_w"), "wheel": ("x_c", "v_c")}
 
 

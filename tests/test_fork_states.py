@@ -46,7 +46,8 @@ from slave_node.states.fork_habits import Event, Habits
 from slave_node.states.held_process import HeldProcess
 from slave_node.worker import ModelReference, WorkerProcess
 from tests.quarter_car_case import DISPLACEMENT
-from tests.state_programs import BOUND, MODELS, begin, fragile, loaded, wait_until, wander, wheel
+from tests.state_programs import MODELS, begin, fragile, loaded, wander, wheel
+from tests.waiting import BOUND, wait_until
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="forks"),
@@ -271,8 +272,14 @@ def test_freed_states_and_closed_slaves_leave_no_process(fmu_dir: Path) -> None:
     assert family() == set()
 
 
-@pytest.mark.timeout(400)
-@pytest.mark.parametrize(("kind", "cycles"), [("native", 10_000), ("fork", 2_000)])
+@pytest.mark.parametrize(
+    ("kind", "cycles"),
+    [
+        ("native", 10_000),
+        ("fork", 200),
+        pytest.param("fork", 2_000, marks=pytest.mark.slow),
+    ],
+)
 def test_nothing_leaks(fmu_dir: Path, kind: str, cycles: int) -> None:
     """Save, step, restore, step, free: memory, descriptors and processes stay as they are."""
 

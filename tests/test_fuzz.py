@@ -14,7 +14,7 @@ from slave_node.claims import Claims
 from tests.fuzz import harness
 from tests.fuzz.harness import Service, fuzz
 from tests.fuzz.messages import KINDS, Mutator
-from tests.test_processes import wait_until
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="measured on POSIX only")
 

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -19,14 +18,13 @@ from protocol.keys import RouterKey, SlaveKey
 from slave_node.certificates import Host, make_certificates
 from slave_node.health import check_alive
 from tests.quarter_car_case import EXAMPLES
+from tests.waiting import BOUND, wait_until
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="uses signals"),
     pytest.mark.usefixtures("no_process_left"),
 ]
 
-BOUND = 30.0
-"""No wait in these tests is longer [s]."""
 
 Start = Callable[..., subprocess.Popen[bytes]]
 
@@ -46,11 +44,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
                 stderr=subprocess.STDOUT,
             )
         started.append(process)
-        end = time.monotonic() + BOUND
-        while " ready: " not in log.read_text():
-            assert process.poll() is None, log.read_text()
-            assert time.monotonic() < end, log.read_text()
-            time.sleep(0.02)
+        wait_until(lambda: " ready: " in log.read_text() or process.poll() is not None)
+        assert process.poll() is None, log.read_text()
         return process
 
     yield start_command

@@ -14,13 +14,15 @@ from protocol.agents import CHUNK_BYTES
 from tests.network_namespaces import Hosts
 from tests.test_agents import long_wheel, slave_processes, system_file
 from tests.test_network import Commands, hosts, start
-from tests.test_processes import has_stepped, wait_until, worker_of
+from tests.test_processes import has_stepped, worker_of
+from tests.waiting import wait_until
 
 __all__ = ["hosts", "long_wheel", "start"]
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="uses signals"),
     pytest.mark.usefixtures("no_process_left"),
+    pytest.mark.slow,
 ]
 
 SIMULATION = "stop_time = 2.5\nlargest_step_size = 1e-3\n"

@@ -19,7 +19,8 @@ from protocol.errors import SlaveLostError
 from protocol.zenoh_bus import ZenohBus
 from tests.network_namespaces import Hosts, hosts_on_a_bridge, unavailable
 from tests.quarter_car_case import EXAMPLES
-from tests.test_processes import MODELS, Command, system_file, toml, wait_until
+from tests.test_processes import MODELS, Command, system_file, toml
+from tests.waiting import BOUND, wait_until
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="uses signals"),
@@ -27,8 +28,6 @@ pytestmark = [
 ]
 
 ROOT = Path(__file__).parents[1]
-BOUND = 30.0
-"""No wait in these tests is longer [s]."""
 
 NAP = 0.5
 """How long a step takes during which a cable is pulled [s]."""

@@ -71,14 +71,13 @@ from protocol.slave import SlaveDescription
 from protocol.zenoh_bus import ZenohBus
 from slave_node.node import SlaveNode
 from slave_node.worker import ModelReference, WorkerProcess
+from tests.waiting import BOUND, is_quick, wait_until
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="uses named pipes and signals"),
     pytest.mark.usefixtures("no_process_left"),
 ]
 
-BOUND = 20.0
-"""No wait in these tests is longer [s]."""
 
 KEY = SlaveKey("slave", "0123abcd")
 
@@ -356,14 +355,6 @@ def background() -> Iterator[Callable[[Callable[[], object]], list[object]]]:
 Background = Callable[[Callable[[], object]], list[object]]
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    """For what no event tells of: a state of another process or thread."""
-    end = time.monotonic() + BOUND
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
 # ---- Claim, execute, release -------------------------------------------------------------------
 
 
@@ -514,7 +505,7 @@ def test_a_crash_of_the_model_is_an_answer(serve: Serve, what: str, words: str) 
     assert first.execute(DoStep(0.0, 0.5)).error is None
     begin = time.perf_counter()
     crashed = first.execute(DoStep(0.5, 1.0))
-    assert time.perf_counter() - begin < 2.0
+    assert is_quick(time.perf_counter() - begin, 2.0)
     assert type(crashed.error) is SlaveCrashedError
     assert words in str(crashed.error)
     assert type(first.execute(GetOutputs()).error) is SlaveKilledError
@@ -588,7 +579,7 @@ def test_status_is_answered_during_a_long_step(
     begun.wait()
     begin = time.perf_counter()
     status = master.status()
-    assert time.perf_counter() - begin < 0.5
+    assert is_quick(time.perf_counter() - begin, 0.5)
     assert status["busy"]
     assert status["state"] == "held"
     assert "run-1" in status["holder"]
@@ -618,7 +609,7 @@ def test_abort_ends_an_endless_step(
     begin = time.perf_counter()
     decode_map(master.ask(ABORT, encode_map({"epoch": master.epoch})))
     wait_until(lambda: bool(outcome))
-    assert time.perf_counter() - begin < 2.0
+    assert is_quick(time.perf_counter() - begin, 2.0)
     (reply,) = outcome
     assert isinstance(reply, Reply)
     assert type(reply.error) is SlaveKilledError
@@ -691,7 +682,7 @@ def test_a_slave_of_a_dead_master_is_free_at_once(
     mortal.wait(BOUND)
     begin = time.perf_counter()
     wait_until(lambda: other.status()["state"] == "free")
-    assert time.perf_counter() - begin < 2.0
+    assert is_quick(time.perf_counter() - begin, 2.0)
     late = Master(served.bus, "run-1", epoch=master.epoch, sequence=master.sequence)
     assert type(late.execute(GetOutputs()).error) is SequenceError
     other.claim().start().release()
@@ -725,18 +716,29 @@ def test_a_master_says_how_long_it_is_to_be_waited_for(serve: Serve) -> None:
 
 @in_process
 def test_a_master_that_came_back_is_waited_for_anew(serve: Serve) -> None:
-    """What is left of an earlier absence does not count."""
+    """What is left of an earlier absence does not count.
+
+    On a busy machine an absence may get too long; then both are repeated with more time.
+    """
     served = serve()
     bus = served.bus
     assert isinstance(bus, InProcessBus)
-    master, vanish = vanishing(served, "run-1", host="elsewhere", pid=1, orphan_time=0.6)
-    vanish()
-    time.sleep(0.4)
-    bus.announce(alive_master("run-1"))
-    bus.withdraw(alive_master("run-1"))
-    time.sleep(0.4)  # 0.8 s after the first absence began, 0.4 s after the second
-    assert master.status()["state"] == "held"
-    wait_until(lambda: master.status()["state"] == "free")
+    for orphan_time in (0.6, 2.4, 9.6, 38.4):
+        place = {"host": "elsewhere", "pid": 1, "orphan_time": orphan_time}
+        master, vanish = vanishing(served, "run-1", **place)
+        begins = [time.monotonic()]
+        vanish()
+        time.sleep(0.7 * orphan_time)
+        bus.announce(alive_master("run-1"))
+        begins.append(time.monotonic())
+        bus.withdraw(alive_master("run-1"))
+        time.sleep(0.7 * orphan_time)  # 1.4 times the orphan time since the first absence began
+        state = master.status()["state"]
+        begins.append(time.monotonic())
+        wait_until(lambda: master.status()["state"] == "free")  # noqa: B023  called here only
+        if begins[1] - begins[0] < orphan_time > begins[2] - begins[1]:
+            break
+    assert state == "held"
 
 
 @in_process

@@ -16,6 +16,7 @@ from master_node.agent_models import Sent
 from master_node.observers import Attempt, Outcome, RunEnd, RunStart, SlaveStatistics, Statistics
 from master_node.progress import ProgressBar, UploadBar, summary_table
 from master_node.results import summarize
+from tests.waiting import BOUND
 
 START = RunStart(("s.x",), ("m",), 1.0, 5.0, np.zeros(1))
 END = RunEnd(
@@ -102,6 +103,7 @@ def test_a_closed_pipe_does_not_end_the_run() -> None:
     code = """
 from master_node.observers import Outcome, RunEnd, RunStart, Statistics
 from master_node.progress import ProgressBar
+from tests.waiting import BOUND
 import numpy as np
 bar = ProgressBar()
 for _ in range(2):
@@ -114,7 +116,7 @@ print("still here")
         stdout=subprocess.PIPE,
         stderr=writing,
         check=False,
-        timeout=60,
+        timeout=BOUND,
     )
     os.close(writing)
     assert process.stdout == b"still here\n"

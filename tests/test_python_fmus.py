@@ -24,6 +24,7 @@ from protocol.slave import Slave, StateVerdict, StepStatus
 from slave_node.examination import examine
 from slave_node.loading import describe_model, load_slave
 from tests.quarter_car_case import global_errors
+from tests.waiting import BOUND
 
 pytest.importorskip("pythonfmu")
 pytest.importorskip("pythonfmu3")
@@ -303,5 +304,5 @@ def test_attributes_that_are_no_variables_are_not_saved(
 def test_a_model_in_python_can_be_validated(lag: Path) -> None:
     """In a process of its own, down to its end."""
     command = [sys.executable, "-m", "slave_node", "validate", str(lag)]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=BOUND, check=False)
     assert run.returncode == 0, run.stderr

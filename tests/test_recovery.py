@@ -100,8 +100,8 @@ def drawn_traps(number: int, seed: int) -> str:
     ("seed", "settings"),
     [
         (1, 'estimator = "mod"\n'),
-        (2, 'estimator = "rich"\nsequence = "gauss-seidel"\n'),
-        (3, 'estimator = "none"\n'),
+        pytest.param(2, 'estimator = "rich"\nsequence = "gauss-seidel"\n', marks=pytest.mark.slow),
+        pytest.param(3, 'estimator = "none"\n', marks=pytest.mark.slow),
     ],
 )
 def test_killed_slaves_come_back(

@@ -13,21 +13,21 @@ from pathlib import Path
 
 import pytest
 
-from master_node import Result
+from master_node import Result, load_system, resume, simulate
 from tests.fault_points import router, run_point
 from tests.test_processes import (
-    BOUND,
     FOREVER,
     Command,
+    Gates,
     Start,
     assert_summary,
     has_stepped,
     slave_processes,
     start,
     system_file,
-    wait_until,
     worker_of,
 )
+from tests.waiting import BOUND, wait_until
 
 __all__ = ["start"]  # the fixture
 
@@ -36,14 +36,10 @@ pytestmark = [
     pytest.mark.usefixtures("no_process_left"),
 ]
 
-SLOW = "stop_time = 0.4\nlargest_step_size = 2e-4\ninitial_step_size = 1e-4\n"
-"""A run of some seconds."""
 
-
-def in_process_files(start: Start, file: Path, directory: Path) -> list[bytes]:
+def in_process_files(file: Path, directory: Path) -> list[bytes]:
     """The results of an undisturbed run."""
-    master = start("master_node", "run", file, "--in-process", "--no-plot", "--output", directory)
-    assert master.wait(4 * BOUND) == 0, master.text
+    simulate(load_system(file), output=directory, in_process=True)
     return files_of(directory)
 
 
@@ -55,38 +51,32 @@ def files_of(directory: Path) -> list[bytes]:
 # ---- A slave stops, crashes, hangs --------------------------------------------------------------
 
 
-def slow_car(folder: Path, fmu_dir: Path, bus: str = "") -> Path:
-    """The quarter car with so short steps that there is time to disturb it."""
-    file = system_file(
-        folder, fmu_dir / "chassis.fmu", fmu_dir / "wheel.fmu", simulation="", bus=bus
-    )
-    text = file.read_text().replace("initial_step_size = 1e-3\n", SLOW)
-    file.write_text(text)
-    return file
-
-
-@pytest.mark.parametrize("victim", ["node", "worker"])
+@pytest.mark.parametrize("victim", ["node", pytest.param("worker", marks=pytest.mark.slow)])
 def test_a_slave_stopped_for_a_second_changes_nothing(
     victim: str, start: Start, tmp_path: Path, fmu_dir: Path
 ) -> None:
     """SIGSTOP for 1 s in mid run: the master waits, and the results are the same bytes."""
-    file = slow_car(tmp_path, fmu_dir)
-    expected = in_process_files(start, file, tmp_path / "undisturbed")
+    gates = Gates(tmp_path, 0.03, 0.06)
+    file = system_file(
+        tmp_path,
+        gates.model,
+        fmu_dir / "wheel.fmu",
+        simulation="stop_time = 0.1\n",
+        chassis_parameters=gates.parameters,
+    )
     master = start("master_node", "run", file, "--no-plot", "--output", tmp_path / "out")
-    master.wait_for("simulating")
-    wait_until(lambda: has_stepped(tmp_path / "out"))
+    gates.wait_at(0)
     node = slave_processes(master)["wheel"]
     process = node if victim == "node" else worker_of(node)
     process.suspend()
-    time.sleep(0.2)
-    rows = (tmp_path / "out" / "steps.csv").stat().st_size
-    time.sleep(0.8)
-    stopped = (tmp_path / "out" / "steps.csv").stat().st_size
+    gates.open(0)
+    time.sleep(1.0)
+    assert not gates.is_at(1), "it went on without its slave"
     process.resume()
-    assert master.wait(4 * BOUND) == 0, master.text
-    assert stopped < (tmp_path / "out" / "steps.csv").stat().st_size, "it was over before"
-    assert stopped - rows < 20_000, "it went on without its slave"
-    assert files_of(tmp_path / "out") == expected
+    gates.wait_at(1)
+    gates.open(1)
+    assert master.wait() == 0, master.text
+    assert files_of(tmp_path / "out") == in_process_files(file, tmp_path / "undisturbed")
 
 
 @pytest.mark.parametrize(
@@ -162,16 +152,16 @@ def test_a_faulty_fmu_ends_the_run_and_nothing_else(  # noqa: PLR0917
 # ---- The user's machine -------------------------------------------------------------------------
 
 
-def test_a_full_disk_ends_the_run_with_readable_results(start: Start, tmp_path: Path) -> None:
+def test_a_full_disk_ends_the_run_with_readable_results(tmp_path: Path) -> None:
     """Exit code 7 naming the file; what was written before is whole. The limit is the system's.
 
     When there is room again, ``resume`` goes on to the bytes of a run that always had room.
     """
     file = system_file(
         tmp_path,
-        simulation="stop_time = 4.0\nlargest_step_size = 1e-3\ncheckpoint_interval = 0.1\n",
+        simulation="stop_time = 0.6\nlargest_step_size = 1e-3\ncheckpoint_interval = 0.1\n",
     )
-    expected = in_process_files(start, file, tmp_path / "undisturbed")
+    expected = in_process_files(file, tmp_path / "undisturbed")
     limit = len(expected[0]) // 2
     code = (
         f"import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}));"
@@ -180,7 +170,7 @@ def test_a_full_disk_ends_the_run_with_readable_results(start: Start, tmp_path: 
         "from master_node.cli import main; main()"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=4 * BOUND, check=False
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=BOUND, check=False
     )
     assert done.returncode == 7, done.stderr
     last = done.stderr.splitlines()[-1]
@@ -188,8 +178,7 @@ def test_a_full_disk_ends_the_run_with_readable_results(start: Start, tmp_path: 
     result = Result.load(tmp_path / "out")
     assert len(result.time) > 100
     assert result.summary["outcome"] == "failed"
-    again = start("master_node", "resume", tmp_path / "out", "--no-plot")
-    assert again.wait() == 0, again.text
+    resume(tmp_path / "out")
     assert files_of(tmp_path / "out") == expected
 
 
@@ -225,7 +214,7 @@ def test_a_jump_of_the_wall_clock_changes_nothing(
 ) -> None:
     """In all processes the time of day jumps by a day at every look; no wait depends on it."""
     file = system_file(tmp_path, simulation="stop_time = 0.2\n")
-    expected = in_process_files(start, file, tmp_path / "undisturbed")
+    expected = in_process_files(file, tmp_path / "undisturbed")
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(JUMPING)
     path = os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")])
@@ -278,7 +267,13 @@ def test_a_second_ctrl_c_kills(number: signal.Signals, start: Start, tmp_path: P
 # ---- The wrong model ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [(), ("--in-process",)], ids=["launched", "in process"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param((), id="launched", marks=pytest.mark.slow),
+        pytest.param(("--in-process",), id="in process"),
+    ],
+)
 def test_a_model_with_another_hash_is_refused(
     options: tuple[str, ...], start: Start, tmp_path: Path, fmu_dir: Path
 ) -> None:

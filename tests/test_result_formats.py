@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -47,11 +46,10 @@ from master_node.results import (
 )
 from master_node.results import writer as writer_module
 from protocol.errors import ConfigurationError, ResultsError
+from tests.waiting import BOUND, wait_until
 
 ROOT = Path(__file__).parents[1]
 CAR = ROOT / "examples" / "quarter_car" / "displacement_python.toml"
-BOUND = 60.0
-"""No wait in these tests is longer [s]."""
 
 TEXTS = ("gear", "label")
 START = RunStart(
@@ -430,15 +428,16 @@ def test_a_master_killed_in_mid_run_leaves_a_readable_stream(
             stderr=out,
         )
     path = tmp_path / "out" / "results.arrow"
-    deadline = time.monotonic() + BOUND
+    sizes: set[int] = set()
+
+    def has_grown() -> bool:
+        assert master.poll() is None, log.read_text()
+        if path.exists():
+            sizes.add(path.stat().st_size)
+        return len(sizes) == 4
+
     try:
-        sizes: set[int] = set()
-        while len(sizes) < 4:
-            assert master.poll() is None, log.read_text()
-            assert time.monotonic() < deadline, log.read_text()
-            if path.exists():
-                sizes.add(path.stat().st_size)
-            time.sleep(0.02)
+        wait_until(has_grown, log.read_text)
     finally:
         master.kill()
         master.wait(BOUND)

@@ -30,6 +30,7 @@ from master_node.observers import (
 from master_node.results import STEPS_DTYPE, Recording, Result, ResultsWriter
 from master_node.results import writer as writer_module
 from protocol.errors import ResultsError
+from tests.waiting import BOUND
 
 NAMES = ("wheel.x", "wheel.v", "chassis.x", "chassis.v")
 UNITS = ("m", "m/s", "m", "")
@@ -125,7 +126,7 @@ def run_python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=BOUND,
     )
 
 

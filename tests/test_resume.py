@@ -30,15 +30,8 @@ from master_node.results import completion
 from master_node.results.files import cannot_write
 from protocol.errors import ConfigurationError, InterruptedRunError, ResultsError
 from tests.quarter_car_case import EXAMPLES
-from tests.test_processes import (
-    Start,
-    has_stepped,
-    slave_processes,
-    start,
-    system_file,
-    wait_until,
-    worker_of,
-)
+from tests.test_processes import Start, has_stepped, slave_processes, start, system_file, worker_of
+from tests.waiting import wait_until
 
 __all__ = ["start"]
 

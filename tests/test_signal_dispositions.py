@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+from tests.waiting import BOUND
+
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="uses signals")
 
 NOHUP = """
@@ -40,7 +42,7 @@ def test_commands_can_be_interrupted_also_where_the_suite_runs_under_nohup() -> 
         capture_output=True,
         text=True,
         check=True,
-        timeout=60.0,
+        timeout=BOUND,
     ).stdout.splitlines()
     ignored, meanwhile, after = said
     assert ignored.count("SIG_IGN") == 2

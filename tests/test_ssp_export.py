@@ -28,8 +28,6 @@ from tests.ssp_documents import (
     tables,
 )
 
-pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
-
 
 @pytest.fixture
 def packages(tmp_path: Path, fmu_dir: Path) -> Packages:

@@ -51,8 +51,6 @@ from tests.ssp_documents import (
     through,
 )
 
-pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
-
 
 @pytest.fixture
 def packages(tmp_path: Path, fmu_dir: Path) -> Packages:

@@ -19,8 +19,7 @@ from slave_node.inspection import description_tables, report_table
 from slave_node.loading import load_executor
 from slave_node.validation import Finding, Grade, validate
 from slave_node.worker import ModelReference, WorkerProcess, execute_program
-
-pytestmark = pytest.mark.timeout(300)  # the first one pays for the build of the FMUs
+from tests.waiting import BOUND
 
 
 class LocalWorker:
@@ -282,7 +281,7 @@ def test_an_fmu_that_cannot_be_run_says_why(capability_dir: Path, fmu: str) -> N
     """By the FMU's own log or the name of the library; the exit code is that of FMU errors."""
     model = capability_dir / f"{fmu}.fmu"
     command = [sys.executable, "-m", "slave_node", "validate", str(model), "--json"]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=BOUND, check=False)
     assert run.returncode == 4
     last = json.loads(run.stdout)[-1]
     assert last["grade"] == "problem"
