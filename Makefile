@@ -1,17 +1,21 @@
-# make demo | test | check: each makes its own environment in .venv first, from nothing.
+# make demo | test | slow | check: each makes its own environment in .venv first, from nothing.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 DEVELOPED := $(VENV)/.developed
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
-.PHONY: demo test check fmus benchmark reproduce format clean
+.PHONY: demo test slow check fmus benchmark reproduce format clean
 
 demo: fmus ## the paper's quarter car: two FMU processes, one master, over Zenoh
 	$(BIN)/master-node run examples/quarter_car/displacement.toml --output demo_results
 
-test: $(DEVELOPED) fmus ## the whole test suite
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+test: $(DEVELOPED) fmus ## all tests but the slow ones
+	$(PYTEST) -m "not slow"
+
+slow: $(DEVELOPED) fmus ## the slow tests: more seeds, more cycles, more hosts
+	$(PYTEST) -m slow
 
 check: $(DEVELOPED) ## linter, formatter, type checker, import layers
 	$(BIN)/ruff check .
