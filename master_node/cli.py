@@ -22,7 +22,7 @@ from protocol.endpoints import LOOPBACK
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
 from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.processes import ending_signals
-from protocol.standard_output import guard_standard_output
+from protocol.standard_output import guarded_standard_output, output_of_others
 
 if TYPE_CHECKING:  # each command imports what it needs
     from master_node.observers import Observer
@@ -221,15 +221,17 @@ def run(  # noqa: PLR0917  options of the command line
         observers: list[Observer] = [ProgressBar(quiet=quiet or log_format is LogFormat.JSON)]
         if metrics_port is not None:
             observers.append(_served_metrics(stack, metrics_port, metrics_host))
-        run_system(
-            system,
-            output,
-            in_process=in_process,
-            launch=not no_launch,
-            observers=observers,
-            uploading=stack.enter_context(UploadBar(quiet=quiet)),
-            trace=trace,
-        )
+        uploading = stack.enter_context(UploadBar(quiet=quiet))
+        with output_of_others():
+            run_system(
+                system,
+                output,
+                in_process=in_process,
+                launch=not no_launch,
+                observers=observers,
+                uploading=uploading,
+                trace=trace,
+            )
         _show(output, quiet=quiet, no_plot=no_plot)
 
 
@@ -271,7 +273,8 @@ def resume(
         from master_node.progress import ProgressBar  # noqa: PLC0415
         from master_node.simulation import resume as resume_run  # noqa: PLC0415
 
-        resume_run(directory, observers=(ProgressBar(quiet=quiet),))
+        with output_of_others():
+            resume_run(directory, observers=(ProgressBar(quiet=quiet),))
         _show(directory, quiet=quiet, no_plot=no_plot)
 
 
@@ -317,14 +320,15 @@ def sweep(  # noqa: PLR0917  as above
                 return LocalRunner(workers or _processors(), limit)
             return _dask_runner(dask, held, needs, limit)
 
-        outcome = run_study(
-            study,
-            directory,
-            make_runner,
-            retry_failed=retry_failed,
-            replace=replace,
-            progress=StudyProgress(quiet=quiet),
-        )
+        with output_of_others():
+            outcome = run_study(
+                study,
+                directory,
+                make_runner,
+                retry_failed=retry_failed,
+                replace=replace,
+                progress=StudyProgress(quiet=quiet),
+            )
     typer.echo(directory / TABLE_FILE)
     if outcome.failed:
         raise typer.Exit(1)
@@ -550,9 +554,9 @@ def _end_with_parent() -> None:
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
     configure_logs(LogFormat.TEXT, _TEXT_FORMAT)
-    guard_standard_output()
     try:
-        app()
+        with guarded_standard_output():
+            app()
     except DoublestepError as error:
         if logs_json():
             log.error("%s", error, extra=about(error))

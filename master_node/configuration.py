@@ -652,7 +652,9 @@ class System(_Table):
     inputs: Mapping[Reference, InputValue] = Field(default_factory=dict)
     results: ResultsSettings = ResultsSettings()
     bus: BusSettings = BusSettings()
-    base: Path = Field(default_factory=Path.cwd, exclude=True)
+    base: Annotated[Path, AfterValidator(Path.absolute)] = Field(
+        default_factory=Path.cwd, exclude=True
+    )
     source: str = Field(default="the system", exclude=True)
     places: SystemFilePlaces | SspPlaces = Field(SystemFilePlaces("the system"), exclude=True)
 

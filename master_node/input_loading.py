@@ -23,7 +23,7 @@ from protocol.errors import ConfigurationError
 from protocol.names import nearest
 from protocol.signals import FloatArray
 from protocol.slave import StartValue
-from protocol.user_code import load_module
+from protocol.user_code import load_module, user_context
 
 Columns = Mapping[str, NDArray[Any]]
 """The columns of a file by name, in its order; texts out of a CSV file."""
@@ -230,7 +230,8 @@ def _function(setting: InputSettings, system: System) -> SignalFunction:
     if not is_finite:
         raise ConfigurationError(f"the function is {value!r} at t={start!r} s")
     breakpoints = tuple(sorted(set(map(float, setting.breakpoints))))
-    return SignalFunction(function, breakpoints, setting.order)
+    run = user_context().run
+    return SignalFunction(lambda time: run(function, time), breakpoints, setting.order)
 
 
 def _load_function(reference: str, base: Path) -> Callable[[float], Any]:

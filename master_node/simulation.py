@@ -36,6 +36,7 @@ from master_node.results import (
     is_complete,
 )
 from master_node.resumption import RunMode, can_be_saved, check_models, reopened, saved_system
+from master_node.shared_process import Baseline, SharedProcess, shared_process
 from master_node.slave_group import SlaveGroup
 from master_node.slave_link import SlaveLink
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
@@ -112,7 +113,15 @@ def run(
         trace: file for a trace of all requests; None: none.
     """
     mode = RunMode(in_process, launch)
-    _run(system, directory, mode, observers, recording=recording, uploading=uploading, trace=trace)
+    _run(
+        system,
+        None if directory is None else directory.absolute(),
+        mode,
+        observers,
+        recording=recording,
+        uploading=uploading,
+        trace=None if trace is None else trace.absolute(),
+    )
 
 
 def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None:
@@ -132,7 +141,7 @@ def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None
         ConfigurationError: a model or a table is not the one with which the run began.
         DoublestepError: as `simulate`.
     """
-    directory = Path(directory)
+    directory = Path(directory).absolute()
     store = CheckpointStore(directory)
     with exclusive(directory):
         if finish(directory):
@@ -181,14 +190,15 @@ def _run(
     moment = f"before the {'first' if resumption is None else 'next'} step"
     try:
         check_step_sizes(system)
-        signals = load_signals(system)
         with ExitStack() as stack:
+            baseline = stack.enter_context(shared_process())
+            signals = SharedProcess(baseline).run(load_signals, system)
             if directory is not None:
                 ResultsWriter(directory, settings_of(system, {})).prepare()
                 if resumption is None:
                     stack.enter_context(exclusive(directory))
             traces = [] if trace is None else [stack.enter_context(closing(TraceWriter(trace)))]
-            slaves = stack.enter_context(_slaves(system, directory, mode, uploading))
+            slaves = stack.enter_context(_slaves(system, directory, mode, uploading, baseline))
             _co_simulation(
                 system, signals, directory, mode, observers, slaves, traces, recording, resumption
             ).run()
@@ -305,10 +315,14 @@ def _restorable(slaves: Slaves, system: System, directory: Path | None) -> list[
 
 @contextmanager
 def _slaves(
-    system: System, directory: Path | None, mode: RunMode, uploading: Uploading | None
+    system: System,
+    directory: Path | None,
+    mode: RunMode,
+    uploading: Uploading | None,
+    baseline: Baseline,
 ) -> Iterator[Slaves]:
     if mode.in_process:
-        with slaves_in_process(system) as slaves:
+        with slaves_in_process(system, baseline) as slaves:
             yield slaves
         return
     with tempfile.TemporaryDirectory(prefix="doublestep-") as temporary:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from protocol.calls import Call, Reply
+from master_node.shared_process import SharedProcess
+from protocol.calls import Call, DoStep, Reply
 from protocol.slave import CallExecutor
 
 
@@ -32,10 +33,16 @@ class SlaveLink(Protocol):
 
 
 class LocalSlave:
-    """A slave in the master's own process: no bytes, no bus, the same calls."""
+    """A slave in the master's own process: no bytes, no bus, the same calls.
 
-    def __init__(self, executor: CallExecutor) -> None:
+    Args:
+        executor: of its calls.
+        process: that it shares with the master; None: it changes nothing there.
+    """
+
+    def __init__(self, executor: CallExecutor, process: SharedProcess | None = None) -> None:
         self._executor = executor
+        self._process = process
         self._reply = Reply([], None, 0.0)
 
     @property
@@ -45,7 +52,13 @@ class LocalSlave:
 
     def start(self, calls: Sequence[Call]) -> None:
         """See `SlaveLink`; the program runs here and now."""
-        self._reply = self._executor.execute(calls)
+        execute, process = self._executor.execute, self._process
+        if process is None:
+            self._reply = execute(calls)
+        elif any(type(call) is DoStep for call in calls):
+            self._reply = process.step(execute, calls)
+        else:
+            self._reply = process.run(execute, calls)
 
     def finish(self) -> Reply:
         """See `SlaveLink`."""

@@ -22,6 +22,7 @@ from master_node.launcher import Launcher, Starter
 from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
 from master_node.restarts import Restarts
+from master_node.shared_process import Baseline, SharedProcess
 from master_node.slave_link import LocalSlave, SlaveLink
 from protocol.bus import DEFAULT_ENDPOINT, Bus
 from protocol.calls import Describe
@@ -76,8 +77,12 @@ class Slaves:
 
 
 @contextmanager
-def slaves_in_process(system: System) -> Iterator[Slaves]:
+def slaves_in_process(system: System, baseline: Baseline) -> Iterator[Slaves]:
     """All slaves in this process, without a bus.
+
+    Args:
+        system: what to run.
+        baseline: to which the process returns from what models do to it.
 
     Raises:
         ConfigurationError: a slave has no model, or its model cannot be loaded.
@@ -92,12 +97,13 @@ def slaves_in_process(system: System) -> Iterator[Slaves]:
                     f"{system.places.slave(name)} has no model, so it cannot run in process"
                 )
             scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="doublestep-"))
+            process = SharedProcess(baseline)
             try:
-                executor = load(settings.model, system.base, name, Path(scratch))
+                executor = process.run(load, settings.model, system.base, name, Path(scratch))
             except DoublestepError as error:
                 raise error.located(slave=name) from None
-            stack.callback(executor.close)
-            links[name] = LocalSlave(executor)
+            stack.callback(process.run, executor.close)
+            links[name] = LocalSlave(executor, process)
             descriptions[name] = executor.description
         yield Slaves(links, descriptions)
 

@@ -1,10 +1,15 @@
-"""The standard output of a command, which a reader may leave and a disk may not hold."""
+"""The standard output of a command: its own data alone, as long as there is a reader and a disk.
+
+Models and other code that users bring write where they like. What a command prints may be data for
+another one, so from its start only itself has the way there: descriptor 1 leads to standard error.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TextIO
 
 from protocol.errors import ResultsError
@@ -49,10 +54,44 @@ class _StandardOutput:
         os.close(nowhere)
 
 
-def guard_standard_output() -> None:
+@contextmanager
+def guarded_standard_output() -> Iterator[None]:
     """Let no ``| head`` end this command or change its exit code; a full disk is a `ResultsError`.
 
-    Once for a process, before anything is written.
+    Once for a process, before anything is written. Afterwards nothing gets to the standard output
+    any more: what models print when the process ends is no data either.
     """
-    if sys.stdout is not None:  # closed by who started the command
-        sys.stdout = _StandardOutput(sys.stdout)
+    if sys.stdout is None:  # closed by who started the command
+        yield
+        return
+    given = sys.stdout
+    own = _own_way_out(given)
+    sys.stdout = _StandardOutput(given if own is None else own)
+    try:
+        yield
+    finally:
+        if own is not None:
+            sys.stdout.flush()
+            sys.stdout = sys.stderr
+
+
+def _own_way_out(stream: TextIO) -> TextIO | None:
+    """A stream to where descriptor 1 leads, which leads to standard error from here on."""
+    try:
+        if stream.fileno() != 1:
+            return None  # of a program that runs the command within itself
+        own = os.dup(1)
+        os.dup2(2, 1)
+    except (OSError, ValueError):
+        return None
+    return open(own, "w", encoding=stream.encoding, errors=stream.errors)  # noqa: PTH123
+
+
+@contextmanager
+def output_of_others() -> Iterator[None]:
+    """While this lasts ``print`` writes to standard error: code of users runs."""
+    ours, sys.stdout = sys.stdout, sys.stderr
+    try:
+        yield
+    finally:
+        sys.stdout = ours

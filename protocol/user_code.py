@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import decimal
 import hashlib
 import importlib
 import importlib.util
 import sys
 import traceback
+from contextvars import Context, copy_context
 from pathlib import Path
 from types import ModuleType
+
+import numpy as np
 
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
@@ -25,6 +29,17 @@ def load_module(place: str, base: Path) -> ModuleType:
         ConfigurationError: no such module or file, or its import failed.
     """
     return _from_file(base / place) if place.endswith(".py") else _installed(place)
+
+
+def user_context() -> Context:
+    """A context for code of users: what it tells NumPy and `decimal` holds for itself alone.
+
+    It begins with silence about values that are not finite.
+    """
+    with np.errstate(all="ignore"):
+        context = copy_context()
+    context.run(lambda: decimal.setcontext(decimal.getcontext().copy()))
+    return context
 
 
 def error_text(error: BaseException) -> str:

@@ -30,7 +30,7 @@ from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
 from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.processes import ending_signals
 from protocol.slave import StartValue
-from protocol.standard_output import guard_standard_output
+from protocol.standard_output import guarded_standard_output, output_of_others
 from protocol.toml_text import toml_value
 
 if TYPE_CHECKING:
@@ -392,7 +392,8 @@ def inspect(
     from slave_node.inspection import description_tables  # noqa: PLC0415
     from slave_node.loading import describe_model  # noqa: PLC0415
 
-    description = describe_model(model, Path.cwd())
+    with output_of_others():
+        description = describe_model(model, Path.cwd())
     if as_json:
         typer.echo(json.dumps(_finite(asdict(description)), indent=2))
         return
@@ -418,17 +419,17 @@ def validate(
 
     findings = []
     if as_json:
-        findings = list(trials(model, Path.cwd(), step_size, timeout=timeout))
+        with output_of_others():
+            findings = list(trials(model, Path.cwd(), step_size, timeout=timeout))
         typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
     else:
         from rich.console import Console  # noqa: PLC0415
 
         from slave_node.inspection import report_table  # noqa: PLC0415
 
-        console = Console()
-        with console.status("trying"):
+        with Console(stderr=True).status("trying"), output_of_others():
             findings = list(trials(model, Path.cwd(), step_size, timeout=timeout))
-        console.print(report_table(model, findings))
+        Console().print(report_table(model, findings))
     if not is_usable(findings):
         raise unusable(model)
 
@@ -511,9 +512,9 @@ def _end_with_parent(end: Callable[[str], None]) -> None:
 
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
-    guard_standard_output()
     try:
-        app()
+        with guarded_standard_output():
+            app()
     except DoublestepError as error:
         if logs_json():
             log.error("%s", error, extra=about(error))

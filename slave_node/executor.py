@@ -39,6 +39,7 @@ from protocol.errors import (
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState, refusal
 from protocol.slave import Slave, SlaveDescription, StepStatus
 from slave_node.examination import examine
+from slave_node.floating_point import restore_floating_point
 from slave_node.snapshots import SnapshotStore
 
 _OK = StepStatus.OK
@@ -79,6 +80,7 @@ class Executor:
         """Run calls on this slave from here on."""
         self._slave = slave
         self._is_loaded = True
+        restore_floating_point()  # loading it may have changed that
         self._snapshots = SnapshotStore(slave)
         save, restore = self._snapshots.save, self._snapshots.restore
         set_inputs, do_step, get_outputs = slave.set_inputs, slave.do_step, slave.get_outputs
@@ -146,6 +148,8 @@ class Executor:
             self._mode = mode
             error = self._failed(calls[len(results)], exception)
             return Reply(results, error, perf_counter() - begin)
+        finally:
+            restore_floating_point()
         self._mode = mode
         return Reply(results, None, perf_counter() - begin)
 

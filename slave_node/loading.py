@@ -11,6 +11,7 @@ from protocol.calls import Configure
 from protocol.errors import ModelError
 from protocol.files import is_fmu
 from protocol.slave import CallExecutor, Slave, SlaveDescription
+from protocol.user_code import user_context
 from slave_node.executor import Executor
 from slave_node.model import Model, describe
 from slave_node.model_loading import load_model_class
@@ -85,7 +86,8 @@ def load_model(
     else:
         from slave_node.model_slave import ModelSlave  # noqa: PLC0415  and an FMU no scipy
 
-        slave = ModelSlave(_model_class(model, base))
+        context = user_context()
+        slave = ModelSlave(context.run(_model_class, model, base), context)
     rest = replace(configuration, largest_substep=None, input_substeps=0)
     if rest != DEFAULT:
         slave.close()
@@ -110,7 +112,7 @@ def _describe_alone(model: str, base: Path) -> SlaveDescription:
 
         description = describe_fmu((base / model).resolve())
     else:
-        description = describe(_model_class(model, base))
+        description = describe(user_context().run(_model_class, model, base))
     return replace(description, input_derivatives=input_derivatives(description))
 
 

@@ -13,6 +13,7 @@ import math
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
+from contextvars import Context
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,7 +39,7 @@ from protocol.slave import (
     VariableType,
     refuse_discrete,
 )
-from protocol.user_code import error_text
+from protocol.user_code import error_text, user_context
 from slave_node.model import Model, describe, real
 
 __all__ = ["Model", "ModelSlave", "ModelState", "real"]
@@ -83,13 +84,15 @@ class ModelSlave(Slave):
 
     Args:
         model: the class; the slave makes the instance.
+        context: in which its code runs, see `user_context`; None: a new one.
 
     Raises:
         ModelError: the declarations of the model contradict each other, or its own ``__init__``
             failed.
     """
 
-    def __init__(self, model: type[Model]) -> None:
+    def __init__(self, model: type[Model], context: Context | None = None) -> None:
+        self._run = (context or user_context()).run
         self.description = describe(model)
         if model.solver not in SOLVERS:
             raise ModelError(
@@ -146,7 +149,7 @@ class ModelSlave(Slave):
         self._columns("input", [*inputs, *discrete_inputs], self._input_names)  # each but once
         self._held_columns = self._columns("input", discrete_inputs, self._input_names)
         try:
-            self._model.prepare()
+            self._run(self._model.prepare)
         except DoublestepError:
             raise
         except Exception as error:
@@ -173,7 +176,7 @@ class ModelSlave(Slave):
         self._held_columns = list[int]()
         self._output_columns = self._columns("output", outputs, self._output_names)
         try:
-            self._model = self._model_class()
+            self._model = self._run(self._model_class)
         except Exception as error:
             raise ModelError(f"{self._at('__init__')}: {error_text(error)}") from error
         parameters = [v.name for v in self.description.of(Causality.PARAMETER)]
@@ -375,7 +378,7 @@ class ModelSlave(Slave):
     def _evaluate(self, method: str, size: int, t: float, *args: FloatArray) -> FloatArray:
         """What a method of the model gives, shape (size,); its exceptions as ours."""
         try:
-            value = np.asarray(getattr(self._model, method)(t, *args), dtype=float)
+            value = np.asarray(self._run(getattr(self._model, method), t, *args), dtype=float)
         except DoublestepError:
             raise
         except (ArithmeticError, ValueError) as error:

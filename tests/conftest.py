@@ -141,6 +141,20 @@ def capability_dir(built: Built) -> Path:
 
 
 @pytest.fixture(scope="session")
+def capability_fmu(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """``capability_fmu(name)`` builds one of these FMUs alone."""
+    folder = tmp_path_factory.mktemp("single")
+    example = _example("capabilities", "build")
+    fmus = {fmu.name: fmu for fmu in example.FMUS}
+
+    def build(name: str) -> Path:
+        (path,) = example.build_fmus.build([fmus[name]], folder)
+        return Path(path)
+
+    return build
+
+
+@pytest.fixture(scope="session")
 def no_rollback_dir(fmu_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with the example of FMUs whose state cannot be saved."""
     folder = tmp_path_factory.mktemp("examples") / "no_rollback"

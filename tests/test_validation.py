@@ -159,6 +159,7 @@ CAPABILITIES = {
         halves="",
     ),
     "not_finite": LAG,
+    "changes_process": LAG,
     "plain_lag": LAG,
     "execution_tool": replace(LAG, remark="it needs the tool that exported it"),
     "fixed_step": replace(HELD, **OF_ONE_SIZE),

@@ -303,6 +303,7 @@ def lags() -> Iterator[Fmu]:
         ("crashes", "A lag that crashes beyond 0.25 s", whole),
         ("hangs", "A lag with a step without an end beyond 0.25 s", whole),
         ("not_finite", "A lag whose output is infinite beyond 0.25 s", whole),
+        ("changes_process", "A lag that changes the process around it", whole),
     ):
         yield make_fmu(
             lag_description(name, description),

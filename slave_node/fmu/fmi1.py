@@ -25,6 +25,7 @@ from protocol.calls import StepResult
 from protocol.errors import StepRejectedError
 from protocol.signals import FloatArray
 from protocol.slave import StartValue, StepStatus, VariableType
+from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer
 from slave_node.fmu.fmu_slave import FmuSlave
@@ -186,6 +187,7 @@ class Fmi1Slave(FmuSlave):
         """See `Slave`. A step is always a new one: there is no way back."""
         del no_set_state_prior
         status = self._do_step(communication_point, step_size, _NEW_STEP)
+        restore_floating_point()
         if 0 <= status <= WARNING:
             return StepResult(StepStatus.OK, communication_point + step_size)
         if status == DISCARD:

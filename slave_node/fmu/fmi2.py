@@ -18,6 +18,7 @@ from fmpy.fmi2 import (
 from protocol.calls import StepResult
 from protocol.errors import StepRejectedError
 from protocol.slave import StartValue, StepStatus, VariableType
+from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer
 from slave_node.fmu.fmu_slave import FmuSlave
@@ -162,6 +163,7 @@ class Fmi2Slave(FmuSlave):
     ) -> StepResult:
         """See `Slave`."""
         status = self._do_step(communication_point, step_size, no_set_state_prior)
+        restore_floating_point()
         if 0 <= status <= WARNING:
             return StepResult(_STEP_OK, communication_point + step_size)
         if status == DISCARD:

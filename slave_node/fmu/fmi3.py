@@ -15,6 +15,7 @@ from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
 from protocol.slave import StartValue, StepStatus, VariableType
 from protocol.step_sums import step_to
+from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.archive import PLATFORM_FOLDERS
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL_3, ArrayExchangeBuffer, InputPolynomials
@@ -344,6 +345,7 @@ class Fmi3Slave(FmuSlave):
         """One fmi3DoStep; ``ok`` also if it returned early."""
         self._reached.value = math.nan
         status = self._do_step(time, h, no_set_state_prior)
+        restore_floating_point()
         if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from protocol.errors import SlaveError
 from protocol.signals import MAX_ORDER, FloatArray
 from protocol.slave import Slave, SlaveDescription, StartValue
+from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.exchange import Buffer
 from slave_node.fmu.instance import FmuInstance
 
@@ -62,6 +63,7 @@ class FmuSlave(Slave):
             status = inputs.transfer_derivatives[self._rows_set - 1]()
             if status:
                 self._instance.check(inputs.derivatives_function, status)
+        restore_floating_point()
 
     def get_outputs(self, order: int) -> FloatArray:
         """See `Slave`."""
@@ -83,6 +85,7 @@ class FmuSlave(Slave):
                         status,
                         remedy="leave output derivatives out: derivative_points = 0",
                     )
+            restore_floating_point()
         return outputs.first[order + 1].copy()
 
     def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:

@@ -20,6 +20,7 @@ from fmpy.fmi1 import FMICallException
 from protocol.errors import FatalSlaveError, ModelError, SlaveError
 from protocol.names import nearest
 from protocol.slave import StartValue, VariableType
+from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.archive import PLATFORM_FOLDERS, check_binary
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.embedded_python import forget_modules, own_modules
@@ -196,6 +197,7 @@ class FmuInstance(ABC):
 
     def check(self, function: str, status: int, *, remedy: str = "") -> None:
         """Turn any status that is not OK or a warning into an error with the FMU's own words."""
+        restore_floating_point()
         if status in (OK, WARNING):
             return
         known = 0 <= status < len(_STATUS)
@@ -211,6 +213,8 @@ class FmuInstance(ABC):
         except FMICallException as error:
             self.check(error.function, error.status)
             raise AssertionError from error
+        finally:
+            restore_floating_point()
 
     def value_type(self, kind: VariableType, name: str) -> ValueType:
         """How a variable called ``name`` is exchanged.

@@ -16,6 +16,7 @@ from protocol.calls import StepResult
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
 from protocol.slave import Slave, StartValue, StepStatus
+from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.continuous_model import ContinuousModel, Fmi2Model, Fmi3Model
 from slave_node.fmu.cvode import CVode, Outcome
 from slave_node.fmu.description import FmuModel
@@ -137,6 +138,7 @@ class ModelExchangeSlave(FmuSlave):
         if status:
             self._model.check(self._polynomials.values_function, status)
         self._model.transfer("set", states, self._size)
+        restore_floating_point()
 
     def _derivatives(self, time: float, states: Any, result: Any) -> None:
         if self._size == 0:
@@ -144,10 +146,12 @@ class ModelExchangeSlave(FmuSlave):
             return
         self._set_point(time, states)
         self._model.transfer("derivatives", result, self._size)
+        restore_floating_point()
 
     def _roots(self, time: float, states: Any, result: Any) -> None:
         self._set_point(time, states)
         self._model.transfer("indicators", result, self._indicator_count)
+        restore_floating_point()
         values = np.ctypeslib.as_array(result, (self._indicator_count,))
         values[:] = root_values(values, self._indicators)
 
