@@ -1,4 +1,4 @@
-"""The systems of the examples as they stand, with real FMUs in processes of their own over Zenoh.
+"""The systems of the examples as they stand, with real FMUs, in this process and in their own.
 
 One for each part of what FMUs can do; which example shows what stands in examples/README.md. The
 examples that are not here are run where their subject is tested.
@@ -35,12 +35,13 @@ def capabilities(capability_dir: Path, tmp_path: Path) -> Path:
 Run = Callable[..., Result]
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Run:
-    """``run(file, ...)``: the result files of a system, each slave in a process of its own."""
+@pytest.fixture(params=["in process", pytest.param("launched", marks=pytest.mark.slow)])
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> Run:
+    """``run(file, ...)``: the result files of a system; launched slaves are reached over Zenoh."""
+    place = {"in_process": request.param == "in process", "output": tmp_path / "results"}
 
     def run_system(file: Path, **simulation: Any) -> Result:
-        simulate(load_system(file), output=tmp_path / "results", **simulation)
+        simulate(load_system(file), **place, **simulation)
         result = Result.load(tmp_path / "results")
         assert result.summary["outcome"] == "completed"
         return result

@@ -19,8 +19,10 @@ from tests.test_processes import (
     FOREVER,
     Command,
     Gates,
+    MainCommand,
     Start,
     assert_summary,
+    command,
     has_stepped,
     slave_processes,
     start,
@@ -29,7 +31,7 @@ from tests.test_processes import (
 )
 from tests.waiting import BOUND, wait_until
 
-__all__ = ["start"]  # the fixture
+__all__ = ["command", "start"]  # the fixtures
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="uses signals and limits"),
@@ -133,14 +135,14 @@ def lag_file(folder: Path, fmu: Path, *, bus: str = "", slave: str = "") -> Path
     ],
 )
 def test_a_faulty_fmu_ends_the_run_and_nothing_else(  # noqa: PLR0917
-    fmu: str, exit_code: int, words: str, start: Start, tmp_path: Path, capability_dir: Path
+    fmu: str, exit_code: int, words: str, command: MainCommand, tmp_path: Path, capability_dir: Path
 ) -> None:
     """SIGSEGV, an endless loop, infinity: cause and place in one line, results up to there."""
     file = lag_file(tmp_path, capability_dir / f"{fmu}.fmu", bus="step_timeout = 1.0\n")
     options = ("--no-examine", "--no-plot", "--output", tmp_path / "out")
-    master = start("master_node", "run", file, *options)
-    assert master.wait() == exit_code, master.text
-    last = master.text.splitlines()[-1]
+    code, text = command("run", file, *options)
+    assert code == exit_code, text
+    last = text.splitlines()[-1]
     assert re.search(f"^master-node: {words}", last), last
     assert "SIGSEGV" in last or fmu != "crashes"
     result = Result.load(tmp_path / "out")
@@ -182,16 +184,18 @@ def test_a_full_disk_ends_the_run_with_readable_results(tmp_path: Path) -> None:
     assert files_of(tmp_path / "out") == expected
 
 
-def test_a_second_run_into_one_directory_is_refused(start: Start, tmp_path: Path) -> None:
+def test_a_second_run_into_one_directory_is_refused(
+    start: Start, command: MainCommand, tmp_path: Path
+) -> None:
     """Exit code 7, of ``resume`` too; the first run goes on and loses nothing."""
     file, out = system_file(tmp_path, simulation=FOREVER), tmp_path / "out"
     options = ("--in-process", "--no-plot", "--output", out)
     first = start("master_node", "run", file, *options)
     wait_until(lambda: has_stepped(out))
     for words in (("run", file, *options), ("resume", out)):
-        second = start("master_node", *words)
-        assert second.wait() == 7
-        assert f"another run is writing into {out}; wait for its end" in second.text
+        code, text = command(*words)
+        assert code == 7
+        assert f"another run is writing into {out}; wait for its end" in text
     first.send(signal.SIGINT)
     assert first.wait() == 130
     assert_summary(out, "interrupted")
@@ -275,7 +279,7 @@ def test_a_second_ctrl_c_kills(number: signal.Signals, start: Start, tmp_path: P
     ],
 )
 def test_a_model_with_another_hash_is_refused(
-    options: tuple[str, ...], start: Start, tmp_path: Path, fmu_dir: Path
+    options: tuple[str, ...], command: MainCommand, tmp_path: Path, fmu_dir: Path
 ) -> None:
     """Exit code 2 before a step, with both hashes; with the right one, in any case, it runs."""
     file = system_file(tmp_path, fmu_dir / "chassis.fmu", fmu_dir / "wheel.fmu")
@@ -284,10 +288,10 @@ def test_a_model_with_another_hash_is_refused(
     for given, exit_code in (("0" * 64, 2), (right.upper(), 0)):
         file.write_text(text.replace("[slaves.wheel]", f'[slaves.wheel]\nsha256 = "{given}"'))
         out = tmp_path / f"out {exit_code}"
-        master = start("master_node", "run", file, "--no-plot", "--output", out, *options)
-        assert master.wait() == exit_code, master.text
+        code, text = command("run", file, "--no-plot", "--output", out, *options)
+        assert code == exit_code, text
         if exit_code:
-            last = master.text.splitlines()[-1]
+            last = text.splitlines()[-1]
             assert f"[slaves.wheel] sha256 = '{given}'" in last
             assert right in last
             assert not (out / "results.csv").exists()
@@ -296,6 +300,7 @@ def test_a_model_with_another_hash_is_refused(
 # ---- Drawn points -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="uses signals and /proc")
 def test_a_process_that_is_killed_stopped_or_cut_off_at_a_drawn_point(
     tmp_path: Path, fmu_dir: Path

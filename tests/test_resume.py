@@ -30,10 +30,19 @@ from master_node.results import completion
 from master_node.results.files import cannot_write
 from protocol.errors import ConfigurationError, InterruptedRunError, ResultsError
 from tests.quarter_car_case import EXAMPLES
-from tests.test_processes import Start, has_stepped, slave_processes, start, system_file, worker_of
+from tests.test_processes import (
+    MainCommand,
+    Start,
+    command,
+    has_stepped,
+    slave_processes,
+    start,
+    system_file,
+    worker_of,
+)
 from tests.waiting import wait_until
 
-__all__ = ["start"]
+__all__ = ["command", "start"]
 
 pytestmark = pytest.mark.usefixtures("no_process_left")
 
@@ -302,7 +311,9 @@ def test_ctrl_c_before_a_resumed_run_has_begun(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="uses signals and /proc")
 @pytest.mark.parametrize("accident", ["kill master", "interrupt master"])
-def test_a_master_that_is_killed(accident: str, start: Start, tmp_path: Path) -> None:
+def test_a_master_that_is_killed(
+    accident: str, start: Start, command: MainCommand, tmp_path: Path
+) -> None:
     """SIGKILL and Ctrl-C in mid step: slaves end with it, results are readable, resume goes on."""
     settings = "stop_time = 0.5\nlargest_step_size = 1e-3\ncheckpoint_interval = 0.1\n"
     whole = car(tmp_path / "whole", settings)
@@ -319,13 +330,13 @@ def test_a_master_that_is_killed(accident: str, start: Start, tmp_path: Path) ->
     before = Result.load(out)
     assert len(before.time) > 1
     assert before.time[-1] < 0.32
-    again = start("master_node", "resume", out, "--no-plot")
-    assert again.wait() == 0, again.text
+    code, text = command("resume", out, "--no-plot")
+    assert code == 0, text
     assert contents(out) == contents(tmp_path / "whole" / "out")
     assert not (out / "checkpoint").exists()
-    refused = start("master_node", "resume", out)
-    assert refused.wait() == 7
-    assert "holds no checkpoint" in refused.text
+    code, text = command("resume", out)
+    assert code == 7
+    assert "holds no checkpoint" in text
 
 
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
