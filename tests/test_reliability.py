@@ -288,10 +288,10 @@ def test_a_model_with_another_hash_is_refused(
     for given, exit_code in (("0" * 64, 2), (right.upper(), 0)):
         file.write_text(text.replace("[slaves.wheel]", f'[slaves.wheel]\nsha256 = "{given}"'))
         out = tmp_path / f"out {exit_code}"
-        code, text = command("run", file, "--no-plot", "--output", out, *options)
-        assert code == exit_code, text
+        code, said = command("run", file, "--no-plot", "--output", out, *options)
+        assert code == exit_code, said
         if exit_code:
-            last = text.splitlines()[-1]
+            last = said.splitlines()[-1]
             assert f"[slaves.wheel] sha256 = '{given}'" in last
             assert right in last
             assert not (out / "results.csv").exists()

@@ -198,7 +198,7 @@ FMUS: dict[str, dict[str, Truth]] = {
         "chassis": replace(IN_PYTHON, states=FORKED, zero=UNREACHED),
     },
 }
-NEED_A_PROCESS = ("crashes", "hangs")
+NEED_A_PROCESS = ("crashes", "hangs", "changes_process")
 
 
 @pytest.mark.parametrize(
