@@ -29,6 +29,7 @@ log = logging.getLogger("master_node")
 _MODELS_TIME = 60.0  # an agent reads files that are new to it
 _CHUNK_TIME = 30.0
 _PAUSE = 0.1
+_LOSSES = 3  # of an upload that others displace
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,17 +180,21 @@ class ModelPlacing:
         )
 
     def _send(self, agent: SeenAgent, wanted: WantedModel, file: Path) -> None:
-        """Send the pieces that are not there yet; goes on after a lost connection."""
+        """Send the pieces that are not there yet; goes on after a lost connection, and begins
+        again, a few times, when the agent needed the room for others meanwhile.
+        """
         log.info("sending %s (%d bytes) to agent %s", wanted.name, wanted.size, agent.key.name)
         try:
             with as_file(file) as packed, packed.open("rb") as source:
                 state = self._piece(agent.key, Upload(wanted.sha256, wanted.size, 0, b""))
+                losses = 0
                 while not state.complete:
                     offset = state.received
                     source.seek(offset)
                     data = source.read(CHUNK_BYTES)
                     state = self._piece(agent.key, Upload(wanted.sha256, wanted.size, offset, data))
-                    if not state.complete and state.received <= offset:
+                    losses += state.received < offset
+                    if not state.complete and (state.received == offset or losses > _LOSSES):
                         raise ProtocolError(
                             f"agent {agent.key.name} did not take the piece at {offset}"
                         )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol, Self
 
 from protocol.errors import DoublestepError
 from protocol.keys import SlaveKey
+from protocol.scratch import ScratchDirectory
 from protocol.slave_processes import SlaveProcess, describe_exit, end_all, end_error
 
 
@@ -64,9 +64,7 @@ class Launcher:
         self._log_directory = log_directory
         self._processes: dict[str, SlaveProcess] = {}
         # What a slave that is killed leaves behind goes with it.
-        self._scratch = tempfile.TemporaryDirectory(
-            prefix="doublestep-", ignore_cleanup_errors=True
-        )
+        self._scratch = ScratchDirectory()
 
     def __enter__(self) -> Self:
         return self
@@ -94,7 +92,7 @@ class Launcher:
             key,
             connection=self._connection,
             log=self._log_directory / f"{name}.log",
-            scratch=Path(self._scratch.name),
+            scratch=self._scratch.path,
             processor=processor,
             goes_on=before is not None,
         )
@@ -131,7 +129,7 @@ class Launcher:
     def stop(self, *, at_once: bool = False) -> None:
         """See `Starter`: ask, wait, kill."""
         end_all(self._processes.values(), at_once=at_once)
-        self._scratch.cleanup()
+        self._scratch.close()
 
 
 def _processors() -> list[int]:

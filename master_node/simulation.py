@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -44,6 +43,7 @@ from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.system import resolve
 from master_node.trace import TraceWriter
 from protocol.errors import InterruptedRunError
+from protocol.scratch import ScratchDirectory
 from protocol.slave import SlaveDescription
 
 log = logging.getLogger("master_node")
@@ -325,8 +325,8 @@ def _slaves(
         with slaves_in_process(system, baseline) as slaves:
             yield slaves
         return
-    with tempfile.TemporaryDirectory(prefix="doublestep-") as temporary:
-        logs = Path(temporary) if directory is None else directory / "logs"
+    with ScratchDirectory() as temporary:
+        logs = temporary if directory is None else directory / "logs"
         logs.mkdir(exist_ok=True)
         with slaves_on_bus(system, logs, launch=mode.launch, uploading=uploading) as slaves:
             yield slaves

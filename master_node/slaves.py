@@ -5,7 +5,6 @@ Each way is a context manager that gives a `Slaves` and leaves nothing running b
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -38,6 +37,7 @@ from protocol.errors import (
 )
 from protocol.keys import SlaveKey
 from protocol.logs import add_log_fields
+from protocol.scratch import ScratchDirectory
 from protocol.slave import SlaveDescription
 from protocol.slave_processes import connection_options
 from protocol.zenoh_bus import ZenohBus
@@ -96,10 +96,10 @@ def slaves_in_process(system: System, baseline: Baseline) -> Iterator[Slaves]:
                 raise ConfigurationError(
                     f"{system.places.slave(name)} has no model, so it cannot run in process"
                 )
-            scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="doublestep-"))
+            scratch = stack.enter_context(ScratchDirectory())
             process = SharedProcess(baseline)
             try:
-                executor = process.run(load, settings.model, system.base, name, Path(scratch))
+                executor = process.run(load, settings.model, system.base, name, scratch)
             except DoublestepError as error:
                 raise error.located(slave=name) from None
             stack.callback(process.run, executor.close)

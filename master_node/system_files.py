@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from master_node.ssp.writing import write_package
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.files import as_file, is_fmu
 from protocol.keys import check_name
+from protocol.scratch import ScratchDirectory
 from protocol.slave import SlaveDescription
 from protocol.toml_text import parse_toml
 
@@ -65,8 +65,8 @@ def open_system(path: Path | str) -> Iterator[System]:
     if not is_ssp(path):
         yield load_system(path)
         return
-    with tempfile.TemporaryDirectory(prefix="doublestep-") as scratch:
-        imported = read_ssp(path, Path(scratch))
+    with ScratchDirectory() as scratch:
+        imported = read_ssp(path, scratch)
         for note in imported.notes:
             log.warning("%s", note)
         try:
@@ -144,8 +144,8 @@ def import_system(path: Path, output: Path) -> tuple[str, ...]:
     """
     _check_suffix(path, *_SSP_SUFFIXES)
     _check_suffix(output, ".toml")
-    with tempfile.TemporaryDirectory(prefix="doublestep-") as scratch:
-        imported = read_ssp(path, Path(scratch))
+    with ScratchDirectory() as scratch:
+        imported = read_ssp(path, scratch)
         system = imported.system
         names = _file_names(system)
         tables = _tables(system)

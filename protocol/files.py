@@ -10,8 +10,9 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
+
+from protocol.scratch import ScratchDirectory
 
 DESCRIPTION = "modelDescription.xml"
 
@@ -101,8 +102,8 @@ def as_file(path: Path) -> Iterator[Path]:
     if not path.is_dir():
         yield path
         return
-    with TemporaryDirectory(prefix="doublestep-") as directory:
-        packed = Path(directory) / f"{path.name}.fmu"
+    with ScratchDirectory() as directory:
+        packed = directory / f"{path.name}.fmu"
         with packed.open("wb") as file:
             pack_folder(path, file.write)
         yield packed

@@ -227,7 +227,7 @@ class Agent:
 
         Raises:
             ConfigurationError: this agent takes no models, or as `UploadCache.receive`.
-            ProtocolError, ModelError: as `UploadCache.receive`.
+            ProtocolError, ModelError, SlaveBusyError: as `UploadCache.receive`.
         """
         cache = self._offer.cache
         if cache is None:

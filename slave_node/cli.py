@@ -9,7 +9,6 @@ import os
 import signal
 import socket
 import sys
-import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -29,6 +28,7 @@ from protocol.errors import ConfigurationError, DoublestepError
 from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
 from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.processes import ending_signals
+from protocol.scratch import ScratchDirectory
 from protocol.slave import StartValue
 from protocol.standard_output import guarded_standard_output, output_of_others
 from protocol.toml_text import toml_value
@@ -341,14 +341,12 @@ def agent(  # noqa: PLR0917  options of the command line
 
     _end_on_signals(end)
     with ExitStack() as stack:
-        scratch = stack.enter_context(
-            tempfile.TemporaryDirectory(prefix="doublestep-", ignore_cleanup_errors=True)
-        )
+        scratch = stack.enter_context(ScratchDirectory())
         try:
             bus = ZenohBus(places.own, stop=ending)
             stack.callback(bus.close)
             log.info("on the bus %s", _where(places.own))
-            surroundings = Surroundings(places.of_slaves, Path(scratch), logs)
+            surroundings = Surroundings(places.of_slaves, scratch, logs)
             Agent(bus, key, offer, surroundings).serve(ending)
         except DoublestepError:
             if not ending.is_set():  # else it is what the ending did to what was under way

@@ -19,12 +19,13 @@ from pathlib import Path
 from secrets import token_hex
 
 from protocol.agents import AgentModel, Upload, UploadState, is_sha256
-from protocol.errors import ConfigurationError, ModelError, ProtocolError
+from protocol.errors import ConfigurationError, ModelError, ProtocolError, SlaveBusyError
 from protocol.files import file_sha256
 
 log = logging.getLogger("slave_node")
 
 _IDLE_TIME = 600.0
+_GIVEN_UP_TIME = 10.0  # then an upload is in nobody's way any more
 _STALE_TIME = 86400.0
 _MAX_PARTS = 16
 _SUFFIX = ".fmu"
@@ -109,9 +110,10 @@ class UploadCache:
         return None
 
     def receive(self, upload: Upload, in_use: AbstractSet[str] = frozenset()) -> UploadState:
-        """Take a piece.
+        """Take a piece, if it comes next; the state says which one does.
 
-        A piece that is there already is left; several masters may send one model at once.
+        A piece that is there already is left; several masters may send one model at once. An
+        upload of which nothing was heard for a while goes when there is no room for another one.
 
         Args:
             upload: the piece.
@@ -120,7 +122,8 @@ class UploadCache:
         Raises:
             ConfigurationError: the model is too large, there is no room for it, or a file cannot
                 be written.
-            ProtocolError: the piece does not come next, or the size is another one than before.
+            SlaveBusyError: there is no room as long as other models are being sent.
+            ProtocolError: the size is another one than before.
             ModelError: the whole has another hash; it is thrown away.
         """
         with self._lock:
@@ -151,10 +154,6 @@ class UploadCache:
         if part.size != upload.size:
             raise ProtocolError(
                 f"the model is being sent with {part.size} bytes, not {upload.size}"
-            )
-        if upload.offset > part.received:
-            raise ProtocolError(
-                f"the piece at {upload.offset} does not come next: {part.received} bytes are there"
             )
         part.touched = time.monotonic()
         if upload.offset == part.received and upload.data:
@@ -191,11 +190,16 @@ class UploadCache:
         for sha256, part in list(self._parts.items()):
             if now - part.touched > _IDLE_TIME:
                 self._drop(sha256)
-        if len(self._parts) >= _MAX_PARTS:
-            raise ConfigurationError(f"{_MAX_PARTS} models are being sent already")
+        while len(self._parts) >= _MAX_PARTS:
+            if not self._drop_given_up(now):
+                raise SlaveBusyError(
+                    f"{_MAX_PARTS} models are being sent already", remedy="wait for these"
+                )
         files = self._whole()
-        taken = sum(status.st_size for status in files.values())
-        taken += sum(part.size for part in self._parts.values())
+        whole = sum(status.st_size for status in files.values())
+        while whole + self._sent() + size > self._capacity and self._drop_given_up(now):
+            pass
+        taken = whole + self._sent()
         for path in sorted(files, key=lambda path: files[path].st_mtime_ns):
             if taken + size <= self._capacity:
                 break
@@ -204,11 +208,28 @@ class UploadCache:
                 taken -= files[path].st_size
                 log.info("made room: removed the uploaded model %s", path.stem)
         if taken + size > self._capacity:
+            if taken - self._sent() + size <= self._capacity:
+                raise SlaveBusyError(
+                    f"there is no room for a model of {size} bytes while others are being sent",
+                    remedy="wait for these",
+                )
             raise ConfigurationError(
                 f"there is no room for a model of {size} bytes: {taken} of {self._capacity} are "
                 "in use",
                 remedy="raise --cache-limit of the agent",
             )
+
+    def _sent(self) -> int:
+        """What the models need that are being sent [bytes]."""
+        return sum(part.size for part in self._parts.values())
+
+    def _drop_given_up(self, now: float) -> bool:
+        """Throw away the upload that is idle for longest, if it is for long; whether it was."""
+        sha256 = min(self._parts, key=lambda name: self._parts[name].touched, default=None)
+        if sha256 is None or now - self._parts[sha256].touched <= _GIVEN_UP_TIME:
+            return False
+        self._drop(sha256)
+        return True
 
     def _drop(self, sha256: str) -> None:
         part = self._parts.pop(sha256, None)

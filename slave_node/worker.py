@@ -10,11 +10,9 @@ import ctypes
 import logging
 import multiprocessing
 import os
-import shutil
 import signal
 import socket
 import sys
-import tempfile
 import threading
 import traceback
 from collections.abc import Mapping
@@ -35,6 +33,7 @@ from protocol.errors import (
 )
 from protocol.logs import LogFormat, configure_logs
 from protocol.python_processes import restore_path, safe_path
+from protocol.scratch import ScratchDirectory
 from protocol.slave import CallExecutor, SlaveDescription, StartValue
 from slave_node.deaths import OWN_FAILURE, death, how_ended
 from slave_node.pipe import Pipe
@@ -118,7 +117,7 @@ class WorkerProcess:
         self._process: BaseProcess | None = None
         self._pipe: Pipe | None = None
         self._guard: threading.Thread | None = None
-        self._scratch: str | None = None
+        self._scratch: ScratchDirectory | None = None
         self._using = threading.Lock()
         """Held while the pipe is in use; ``kill`` needs none and makes the holder let go."""
 
@@ -134,12 +133,12 @@ class WorkerProcess:
 
     def _start(self) -> SlaveDescription:
         self._discard()
-        self._scratch = tempfile.mkdtemp(prefix="doublestep-")
+        self._scratch = ScratchDirectory()
         context = multiprocessing.get_context("spawn")
         ours, theirs = socket.socketpair()
         self._pipe = Pipe(ours)
         self._process = context.Process(
-            target=_main, args=(theirs, self._reference, self._scratch), daemon=True
+            target=_main, args=(theirs, self._reference, str(self._scratch.path)), daemon=True
         )
         with safe_path():
             self._process.start()
@@ -229,7 +228,7 @@ class WorkerProcess:
             self._pipe.close()
             self._pipe = None
         if self._scratch is not None:
-            shutil.rmtree(self._scratch, ignore_errors=True)
+            self._scratch.close()
             self._scratch = None
 
     def _wait_ended(self, process: BaseProcess, timeout: float) -> None:

@@ -26,7 +26,8 @@ import psutil
 import pytest
 
 from master_node import System, load_system, simulate
-from master_node.agent_models import Sent
+from master_node.agent_models import ModelPlacing, Sent, WantedModel
+from master_node.agent_requests import SeenAgent
 from master_node.agents import Agents
 from master_node.simulation import run as run_system
 from protocol.agents import (
@@ -67,6 +68,7 @@ from protocol.errors import (
     VersionError,
 )
 from protocol.keys import MODELS, OUTPUT, START, STOP, UPLOAD, AgentKey, MasterKey, SlaveKey
+from slave_node import upload_cache
 from slave_node.agent import Agent, Offer, Surroundings
 from slave_node.agent_options import default_cache, parse_labels, parse_licences, places_of
 from slave_node.certificates import Host, make_certificates
@@ -383,15 +385,14 @@ def pieces(data: bytes, sha256: str | None = None) -> list[Upload]:
 
 
 def test_an_upload_goes_on_where_it_was_and_two_may_send_at_once(tmp_path: Path) -> None:
-    """Pieces that are there are left, pieces that do not come next are refused, and the whole is
-    the file; several threads that send it get it there once.
+    """Pieces that are there, or do not come next, are left, and the whole is the file; several
+    threads that send it get it there once.
     """
     cache = UploadCache(tmp_path / "cache", 10 * MB, 20 * MB)
     data = os.urandom(2 * CHUNK_BYTES + 5)
     first, second, third = pieces(data)
     assert cache.receive(first) == UploadState(CHUNK_BYTES, False)
-    with pytest.raises(ProtocolError, match="does not come next: 1048576 bytes are there"):
-        cache.receive(third)
+    assert cache.receive(third) == UploadState(CHUNK_BYTES, False)
     ask = Upload(first.sha256, len(data), 0, b"")
     assert cache.receive(ask) == cache.receive(first) == UploadState(CHUNK_BYTES, False)
     with pytest.raises(ProtocolError, match="is being sent with"):
@@ -465,12 +466,64 @@ def test_the_cache_is_bounded_and_keeps_what_is_in_use(tmp_path: Path) -> None:
         send(data[3], *hashes)
     cache.receive(pieces(data[3])[0], {hashes[2]})
     assert there() == [False, False, True, False]
-    with pytest.raises(ConfigurationError, match="no room"):
+    with pytest.raises(SlaveBusyError, match=r"no room .* while others are being sent"):
         cache.receive(Upload(hashes[0], 2 * CHUNK_BYTES, 0, b""), {hashes[2]})
     with pytest.raises(ConfigurationError, match=r"is not taken, only up to 4194304; .*--upload"):
         cache.receive(Upload(hashes[0], 4 * CHUNK_BYTES + 1, 0, b""))
     cache.close()
     assert len(list(cache.directory.iterdir())) == 1
+
+
+@pytest.mark.parametrize("lack", ["places", "room"])
+def test_uploads_that_were_given_up_hold_up_nobody(
+    lack: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sixteen that were begun, or two that announce all the room: others wait for a while, then
+    the one goes that was heard of the longest ago. Who comes back to it begins again.
+    """
+    begun, size, capacity = (16, 2 * MB, 100 * MB) if lack == "places" else (2, 10 * MB, 20 * MB)
+    cache = UploadCache(tmp_path / "cache", 10 * MB, capacity)
+    data = [bytes([i]) * size for i in range(begun)]
+    for item in data:
+        cache.receive(pieces(item)[0])
+    cache.receive(Upload(hashlib.sha256(data[0]).hexdigest(), size, 0, b""))  # heard of again
+    new = b"new" * 1000
+    with pytest.raises(SlaveBusyError, match="being sent"):
+        cache.receive(*pieces(new if lack == "places" else new * 400))
+    monkeypatch.setattr(upload_cache, "_GIVEN_UP_TIME", 0.0)
+    assert cache.receive(*pieces(new)).complete
+    for number, (item, is_left) in enumerate(zip(data, (True, False), strict=False)):
+        state = cache.receive(pieces(item)[-1])
+        assert (state.received > 0) == is_left, number
+
+
+def test_a_model_is_sent_again_whose_upload_others_displaced(
+    serve_agent: ServeAgent, models: Path, tmp_path: Path, long_wheel: Path
+) -> None:
+    """From its beginning, a few times; then the error says so."""
+    cache = UploadCache(tmp_path / "cache", 10 * MB, 20 * MB)
+    served = serve_agent(Offer({}, {}, ModelStore(models), cache))
+    seen = SeenAgent(KEY, served.agent.status())
+    sha256 = hashlib.sha256(long_wheel.read_bytes()).hexdigest()
+    size = long_wheel.stat().st_size
+    wanted = WantedModel("wheel", long_wheel, "long_wheel.fmu", "", sha256, size)
+    sent: list[int] = []
+    often = 1
+
+    def lose(told: Sent) -> None:
+        sent.append(told.sent)
+        if told.sent == 2 * CHUNK_BYTES and sent.count(told.sent) <= often:
+            cache.close()
+
+    placing = ModelPlacing(served.bus, 1.0, lose)
+    assert placing.place(seen, wanted) == (sha256, sha256)
+    assert sent == [CHUNK_BYTES, 2 * CHUNK_BYTES, 0, CHUNK_BYTES, 2 * CHUNK_BYTES, size]
+    path = cache.path(sha256)
+    assert path is not None
+    path.unlink()
+    often = 100
+    with pytest.raises(ProtocolError, match="did not take the piece"):
+        placing.place(seen, wanted)
 
 
 def test_a_cache_for_others_is_refused_and_old_pieces_go(tmp_path: Path) -> None:

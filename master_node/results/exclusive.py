@@ -3,36 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
+from protocol.directory_locks import lock_directory
 from protocol.errors import ResultsError
-
-if sys.platform == "win32":
-    _LOCK_FILE = ".lock"
-
-    def _lock(directory: Path) -> int:
-        """A file that goes with the process that holds it."""
-        flags = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_TEMPORARY
-        return os.open(directory / _LOCK_FILE, flags)
-
-    _TAKEN: tuple[type[OSError], ...] = (FileExistsError, PermissionError)
-else:
-    import fcntl
-
-    def _lock(directory: Path) -> int:
-        """The directory itself, by a lock that goes with the process that holds it."""
-        descriptor = os.open(directory, os.O_RDONLY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(descriptor)
-            raise
-        return descriptor
-
-    _TAKEN = (BlockingIOError,)
 
 
 @contextmanager
@@ -44,19 +20,15 @@ def exclusive(directory: Path) -> Iterator[None]:
     Raises:
         ResultsError: another run is writing into it.
     """
-    descriptor = None
     try:
-        with suppress(FileNotFoundError):
-            descriptor = _lock(directory)
-    except _TAKEN as error:
+        lock = lock_directory(directory)
+    except BlockingIOError as error:
         raise ResultsError(
             f"another run is writing into {directory}",
             remedy="wait for its end, or choose another results directory",
         ) from error
-    except OSError:  # such as network file systems that lock files only
-        pass
     try:
         yield
     finally:
-        if descriptor is not None:
-            os.close(descriptor)
+        if lock is not None:
+            os.close(lock)

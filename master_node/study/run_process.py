@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from master_node.study.directory import put_in_place
 from master_node.study.records import CASE_FILE, LOG_FILE, RunRecord, write_record
 from protocol.errors import DeadlineError, ResultsError
 from protocol.python_processes import python_command
+from protocol.scratch import ScratchDirectory
 
 END_TIME = 0.2
 """How long an interrupted run has to end by itself [s]; nothing that it wrote is kept."""
@@ -68,9 +68,7 @@ class RunProcess:
         self._is_late = False
         try:
             # What a run that is killed leaves behind goes with it.
-            self._scratch = tempfile.TemporaryDirectory(
-                prefix="doublestep-", ignore_cleanup_errors=True
-            )
+            self._scratch = ScratchDirectory()
             self._part.mkdir(parents=True)
             write_case(self._part / CASE_FILE, task.case)
             with (self._part / LOG_FILE).open("wb") as log:
@@ -80,7 +78,7 @@ class RunProcess:
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,  # Ctrl-C is for the sweep, which ends its runs
-                    env=_environment(self._scratch.name),
+                    env=_environment(self._scratch.path),
                 )
         except OSError as error:
             raise ResultsError(f"cannot start run {task.number}: {error}") from error
@@ -108,7 +106,7 @@ class RunProcess:
                 return None
         self.interrupt()  # it has ended: its standard input is of no more use
         record = self._record(self._process.returncode)
-        self._scratch.cleanup()
+        self._scratch.close()
         try:
             write_record(self._part, record)
             put_in_place(self._part, self._directory)
@@ -136,7 +134,7 @@ class RunProcess:
 
     def remove(self) -> None:
         """Take away what an interrupted run has written."""
-        self._scratch.cleanup()
+        self._scratch.close()
         shutil.rmtree(self._part, ignore_errors=True)
 
     def _record(self, exit_code: int) -> RunRecord:
@@ -161,7 +159,7 @@ class RunProcess:
         return ""
 
 
-def _environment(scratch: str) -> dict[str, str]:
+def _environment(scratch: Path) -> dict[str, str]:
     """Runs beside each other are what uses the processors: no threads of NumPy within one."""
     quiet = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
-    return {**quiet, **os.environ, "TMPDIR": scratch}
+    return {**quiet, **os.environ, "TMPDIR": str(scratch)}

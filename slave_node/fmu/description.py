@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -14,6 +13,7 @@ from fmpy import read_model_description
 
 from protocol.errors import ModelError
 from protocol.files import DESCRIPTION, Contents
+from protocol.scratch import ScratchDirectory
 from protocol.slave import Causality, SlaveDescription, StartValue, StateKind, VariableType
 from slave_node.fmu.archive import extract
 from slave_node.fmu.embedded_python import log_categories, slave_module
@@ -61,8 +61,8 @@ def describe_fmu(fmu: Path) -> SlaveDescription:
     Raises:
         ModelError: the file is missing, unsafe, or not an FMU that can be run.
     """
-    with TemporaryDirectory(prefix="doublestep-") as directory:
-        return read_fmu(fmu, Path(directory)).description
+    with ScratchDirectory() as directory:
+        return read_fmu(fmu, directory).description
 
 
 def read_fmu(

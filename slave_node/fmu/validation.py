@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from fmpy import read_model_description
 from fmpy.model_description import ValidationError
 
+from protocol.scratch import ScratchDirectory
 from slave_node.fmu.archive import extract
 
 MAX_NAMES = 1000
@@ -30,8 +30,8 @@ def check_description(fmu: Path) -> DescriptionCheck:
     Raises:
         ModelError: the file is missing, unsafe or no FMU.
     """
-    with TemporaryDirectory(prefix="doublestep-") as directory:
-        extract(fmu, Path(directory))
+    with ScratchDirectory() as directory:
+        extract(fmu, directory)
         parses_names = False
         try:
             described = read_model_description(directory, validate=False)
