@@ -1,18 +1,24 @@
 """The co-simulation master: `System` describes, `simulate` runs, `Result` holds what came out."""
 
-from master_node.configuration import (
-    BusSettings,
-    Connection,
-    InputSettings,
-    ResultsSettings,
-    SimulationSettings,
-    SlaveSettings,
-    System,
-    load_system,
-)
-from master_node.results import Result
-from master_node.simulation import resume, simulate
-from master_node.system_files import open_system
+from __future__ import annotations
+
+from importlib import import_module
+
+TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than all else here
+if TYPE_CHECKING:
+    from master_node.configuration import (
+        BusSettings,
+        Connection,
+        InputSettings,
+        ResultsSettings,
+        SimulationSettings,
+        SlaveSettings,
+        System,
+        load_system,
+    )
+    from master_node.results import Result
+    from master_node.simulation import resume, simulate
+    from master_node.system_files import open_system
 
 __all__ = [
     "BusSettings",
@@ -28,3 +34,20 @@ __all__ = [
     "resume",
     "simulate",
 ]
+
+_ELSEWHERE = {
+    "Result": "results",
+    "open_system": "system_files",
+    "resume": "simulation",
+    "simulate": "simulation",
+}
+"""Modules of what is not in ``configuration``."""
+
+
+def __getattr__(name: str) -> object:
+    """What is public, imported when it is asked for: commands need but a part of it."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_ELSEWHERE.get(name, 'configuration')}"), name)
+    globals()[name] = value
+    return value

@@ -1,6 +1,12 @@
-"""``python -m master_node`` is the ``master-node`` command."""
+"""The ``master-node`` command, also as ``python -m master_node``. Imports as little as can be."""
 
-from master_node.cli import main
+from protocol.command_start import run_command
+
+
+def main() -> None:
+    """Entry point."""
+    run_command("master-node", "master_node.cli")
+
 
 if __name__ == "__main__":
     main()

@@ -36,7 +36,7 @@ from protocol.errors import DoublestepError, ResultsError
 _SYSTEM_FILE = "system.json"
 _RUN_FILE = "run.zip"
 _RUN = "run.json"
-_VERSION = 1
+_VERSION = 2
 _LENGTH = Struct("<I")
 _LARGEST = 2**30
 

@@ -8,21 +8,21 @@ import logging
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from protocol.credentials import Credentials, Role
 from protocol.endpoints import LOOPBACK
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
+from protocol.interruption import interruptible
 from protocol.logs import LogFormat, about, configure_logs, logs_json
-from protocol.processes import ending_signals
 from protocol.standard_output import guarded_standard_output, output_of_others
+from protocol.threads import start_thread
 
 if TYPE_CHECKING:  # each command imports what it needs
     from master_node.observers import Observer
@@ -160,7 +160,7 @@ def run(  # noqa: PLR0917  options of the command line
 ) -> None:
     """Run SYSTEM and write results, by default results.csv, steps, summary and a picture."""
     configure_logs(log_format, _TEXT_FORMAT)
-    with _interruptible(), ExitStack() as stack:
+    with interruptible(), ExitStack() as stack:
         if stay_with_parent:
             _end_with_parent()
         if in_process:
@@ -269,7 +269,7 @@ def resume(
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
 ) -> None:
     """Go on with the run in DIRECTORY that was interrupted or killed, with the settings it had."""
-    with _interruptible():
+    with interruptible():
         from master_node.progress import ProgressBar  # noqa: PLC0415
         from master_node.simulation import resume as resume_run  # noqa: PLC0415
 
@@ -302,7 +302,7 @@ def sweep(  # noqa: PLR0917  as above
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
 ) -> None:
     """Run a system once for each case of a study; go on where an earlier sweep ended."""
-    with _interruptible():
+    with interruptible():
         from master_node.study.configuration import load_study  # noqa: PLC0415
         from master_node.study.directory import TABLE_FILE  # noqa: PLC0415
         from master_node.study.execution import run_study  # noqa: PLC0415
@@ -351,7 +351,8 @@ def plot(
 
     path = file or directory / PLOT_FILE
     try:
-        plot_result(Result.load(directory), path, show=show, variables=variable or None)
+        with interruptible():
+            plot_result(Result.load(directory), path, show=show, variables=variable or None)
     except KeyError as error:
         raise ConfigurationError(f"{directory}: {error.args[0]}", phase="plot") from None
     typer.echo(path)
@@ -391,8 +392,9 @@ def import_(
     from master_node.system_files import import_system  # noqa: PLC0415
 
     path = output or package.with_name(f"{package.stem.replace('.ssp#', '_')}.toml")
-    for note in import_system(package, path):
-        log.warning("%s", note)
+    with interruptible():
+        for note in import_system(package, path):
+            log.warning("%s", note)
     typer.echo(path)
 
 
@@ -409,7 +411,8 @@ def export(
     from master_node.system_files import export_system  # noqa: PLC0415
 
     path = output or system_file.with_suffix(".ssp")
-    export_system(system_file, path)
+    with interruptible():
+        export_system(system_file, path)
     typer.echo(path)
 
 
@@ -491,7 +494,7 @@ def _windows(
 
     credentials = _credentials(tls)
     with (
-        _interruptible(),
+        interruptible(),
         windows(connect or (), listen or (), insecure=insecure, credentials=credentials) as opened,
     ):
         yield opened
@@ -516,28 +519,6 @@ def _order(text: str | None) -> int | str | None:
     return int(text) if text is not None and text.isdecimal() else text
 
 
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Ctrl-C, SIGTERM and SIGHUP end the command with exit code 130; the first two also where a
-    shell ignores them.
-
-    A second one kills it: what it launched ends with it.
-    """
-    ending = ending_signals()
-
-    def interrupt(*_: object) -> NoReturn:
-        for number in ending:
-            signal.signal(number, signal.SIG_DFL)
-        raise KeyboardInterrupt
-
-    for number in ending:
-        signal.signal(number, interrupt)
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise InterruptedRunError("interrupted") from None
-
-
 def _end_with_parent() -> None:
     """Our standard input is the parent's end of a pipe: it closes when the parent is gone."""
 
@@ -548,7 +529,7 @@ def _end_with_parent() -> None:
         time.sleep(_END_TIME)
         os._exit(InterruptedRunError.exit_code)  # a model in this process does not come back
 
-    threading.Thread(target=watch, name="parent", daemon=True).start()
+    start_thread(watch, "parent")
 
 
 def main() -> None:

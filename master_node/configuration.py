@@ -641,6 +641,7 @@ class System(_Table):
         base: directory to which the models' paths are relative; default: the working directory.
         source: what to call this in messages: the file's name.
         places: what to call its parts there.
+        unpacked: directory into which packages were unpacked for this time; None: there are none.
 
     Raises:
         ConfigurationError: a table is wrong; the message has a line for each mistake.
@@ -657,6 +658,7 @@ class System(_Table):
     )
     source: str = Field(default="the system", exclude=True)
     places: SystemFilePlaces | SspPlaces = Field(SystemFilePlaces("the system"), exclude=True)
+    unpacked: Path | None = Field(None, exclude=True)
 
     def __init__(self, **tables: Any) -> None:
         source = str(tables.get("source", "the system"))
@@ -763,6 +765,7 @@ class System(_Table):
             base=self.base,
             source=self.source,
             places=self.places,
+            unpacked=self.unpacked,
         )
 
 
@@ -863,4 +866,4 @@ def _known_keys(place: list[str]) -> list[str]:
             return [field.alias or name for name, field in Connection.model_fields.items()]
         case ["inputs", _]:
             model = InputSettings
-    return [name for name in model.model_fields if name not in ("base", "source", "places")]
+    return [name for name, field in model.model_fields.items() if not field.exclude]

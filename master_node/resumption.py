@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from master_node.configuration import InputSettings, System
-from master_node.system_files import is_package, open_system
+from master_node.system_files import open_system
 from protocol.errors import ConfigurationError, ResultsError
 from protocol.files import file_sha256
 from protocol.slave import SlaveDescription
@@ -38,8 +38,9 @@ def saved_system(
     """What was run, as plain data for JSON."""
     tables = system.model_dump(mode="json", by_alias=True, exclude_unset=True, exclude_none=True)
     return {
-        "tables": {k: v for k, v in tables.items() if k not in ("base", "source", "places")},
+        "tables": tables,
         "base": str(system.base),
+        "unpacked": None if system.unpacked is None else str(system.unpacked),
         "source": system.source,
         "path": str(Path(system.source).absolute()),
         "mode": mode._asdict(),
@@ -50,7 +51,7 @@ def saved_system(
 
 @contextmanager
 def reopened(saved: Mapping[str, Any]) -> Iterator[tuple[System, RunMode]]:
-    """The system again; the models of a package are there within the ``with``.
+    """The system again; what it unpacked from packages is there within the ``with``.
 
     Raises:
         ConfigurationError: it cannot be read any more, or a file of its inputs has changed.
@@ -59,11 +60,12 @@ def reopened(saved: Mapping[str, Any]) -> Iterator[tuple[System, RunMode]]:
     try:
         path, base = Path(saved["path"]), Path(saved["base"])
         mode = RunMode(**saved["mode"])
-        if not is_package(path):
-            yield _system(saved, base), mode
+        if saved["unpacked"] is None:
+            yield _system(saved["tables"], saved, base), mode
             return
         with open_system(path) as opened:
-            yield _system(saved, opened.base, places=opened.places), mode
+            tables = _unpacked_again(saved["tables"], Path(saved["unpacked"]), opened)
+            yield _system(tables, saved, opened.base, places=opened.places), mode
     except (KeyError, TypeError) as error:
         raise ResultsError(f"the checkpoint is malformed: {error!r}") from error
 
@@ -84,8 +86,26 @@ def check_models(saved: Mapping[str, Any], descriptions: Mapping[str, SlaveDescr
             )
 
 
-def _system(saved: Mapping[str, Any], base: Path, **places: Any) -> System:
-    system = System(**saved["tables"], base=base, source=saved["source"], **places)
+def _unpacked_again(tables: Mapping[str, Any], before: Path, opened: System) -> dict[str, Any]:
+    """The tables with the models of packages where they are this time."""
+    return {
+        **tables,
+        "slaves": {
+            name: slave | _model_again(slave, before, opened.unpacked)
+            for name, slave in tables["slaves"].items()
+        },
+    }
+
+
+def _model_again(slave: Mapping[str, Any], before: Path, now: Path | None) -> dict[str, str]:
+    model = Path(slave.get("model", ""))
+    if now is None or not model.is_relative_to(before):
+        return {}
+    return {"model": str(now / model.relative_to(before))}
+
+
+def _system(tables: Mapping[str, Any], saved: Mapping[str, Any], base: Path, **more: Any) -> System:
+    system = System(**tables, base=base, source=saved["source"], **more)
     for path, hash_ in saved["files"].items():
         if _sha256(base / path) != hash_:
             raise ConfigurationError(

@@ -126,6 +126,7 @@ def read_ssp(path: Path, scratch: Path) -> ImportedSystem:
         base=base,
         source=str(path),
         places=_places(path, slaves, connections),
+        unpacked=scratch,
     )
     return ImportedSystem(system, notes.sentences())
 

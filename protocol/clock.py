@@ -13,6 +13,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Protocol
 
+from protocol.threads import start_thread, started
+
 
 class Lock(Protocol):
     """What is used of `threading.Lock`."""
@@ -115,16 +117,13 @@ class SystemClock:
 
     def start(self, action: Callable[[], None], name: str) -> Task:
         """See `Clock`."""
-        thread = threading.Thread(target=action, name=name, daemon=True)
-        thread.start()
-        return thread
+        return start_thread(action, name)
 
     def later(self, seconds: float, action: Callable[[], None]) -> Timer:
         """See `Clock`."""
         timer = threading.Timer(seconds, action)
         timer.daemon = True
-        timer.start()
-        return timer
+        return started(timer)
 
 
 SYSTEM_CLOCK = SystemClock()

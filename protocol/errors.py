@@ -6,6 +6,7 @@
     ├── ConfigurationError       the user's file, command line or model is wrong          exit 2
     │   └── ModelError           a model file cannot be loaded or used                    exit 2
     ├── SlaveLostError           a slave is not there, or went away                       exit 3
+    │   └── HostLimitError       the host gives no more memory, threads or processes      exit 3
     ├── SlaveError               a slave could not do what it was asked                   exit 4
     │   ├── StepRejectedError    a step failed in the slave; a smaller one may succeed    exit 4
     │   ├── FatalSlaveError      fmi2Fatal: the model must not be called any more          exit 4
@@ -132,6 +133,10 @@ class SlaveLostError(DoublestepError):
     """A slave never appeared, its process died, or the connection to it is gone."""
 
     exit_code = 3
+
+
+class HostLimitError(SlaveLostError):
+    """The host gives this process no more memory, threads or processes."""
 
 
 class SlaveError(DoublestepError):

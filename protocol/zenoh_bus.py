@@ -21,8 +21,9 @@ from protocol.bus import AliveListener, Bus, Caller, Handler, PendingReply
 from protocol.codec import MAX_MESSAGE_BYTES
 from protocol.credentials import Credentials
 from protocol.endpoints import Endpoints, Mode
-from protocol.errors import ConfigurationError, DeadlineError, SlaveLostError
+from protocol.errors import ConfigurationError, DeadlineError, HostLimitError, SlaveLostError
 from protocol.reachability import Reach, probe_all
+from protocol.threads import LIMITS, start_thread
 
 os.environ.setdefault(
     "ZENOH_RUNTIME",
@@ -95,9 +96,18 @@ def _secured(endpoints: Endpoints) -> tuple[str, ...]:
     return endpoints.connect if endpoints.credentials is not None else ()
 
 
-def _open(endpoints: Endpoints) -> zenoh.Session:
+def _session(endpoints: Endpoints) -> zenoh.Session:
     try:
         return zenoh.open(_config(endpoints))
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":  # it has no other name, and no module
+            raise
+        raise HostLimitError(f"the bus cannot be opened: {error}", remedy=LIMITS) from error
+
+
+def _open(endpoints: Endpoints) -> zenoh.Session:
+    try:
+        return _session(endpoints)
     except zenoh.ZError as error:
         raise ConfigurationError(
             f"cannot open the bus at {', '.join(endpoints.listen)}: {_first_line(error)}",
@@ -115,7 +125,7 @@ def _open_client(
     while not stop.is_set():
         begin = time.monotonic()
         try:
-            return zenoh.open(_config(endpoints))
+            return _session(endpoints)
         except zenoh.ZError:
             if not told:
                 log.info("waiting for a router at %s", where)
@@ -183,7 +193,7 @@ class ZenohBus(Bus):
                         log.error("%s", error)
                 left = [a.endpoint for a in attempts if a.reach is Reach.NOT_REACHED]
 
-        threading.Thread(target=look, name="reachability", daemon=True).start()
+        start_thread(look, "reachability")
 
     def caller(self, key: str, timeout: float) -> Caller:
         """See `Bus`."""
@@ -197,11 +207,7 @@ class ZenohBus(Bus):
         """See `Bus`."""
         with _closed_is_lost():
             queryable = self._session.declare_queryable(key)
-        thread = threading.Thread(
-            target=self._answer, args=(queryable, handler), name=f"serve {key}", daemon=True
-        )
-        self._threads.append(thread)
-        thread.start()
+        self._threads.append(start_thread(lambda: self._answer(queryable, handler), f"serve {key}"))
 
     def serve_here(self, key: str, handler: Handler, ready: Callable[[], None]) -> None:
         """See `Bus`."""

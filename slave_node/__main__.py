@@ -1,6 +1,12 @@
-"""``python -m slave_node`` is the ``slave-node`` command."""
+"""The ``slave-node`` command, also as ``python -m slave_node``. Imports as little as can be."""
 
-from slave_node.cli import main
+from protocol.command_start import run_command
+
+
+def main() -> None:
+    """Entry point."""
+    run_command("slave-node", "slave_node.cli")
+
 
 if __name__ == "__main__":
     main()

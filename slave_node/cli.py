@@ -25,12 +25,14 @@ from protocol.bus import DEFAULT_ENDPOINT
 from protocol.credentials import Credentials, Role
 from protocol.endpoints import LOOPBACK, Endpoints, Mode
 from protocol.errors import ConfigurationError, DoublestepError
+from protocol.interruption import interruptible
 from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
 from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.processes import ending_signals
 from protocol.scratch import ScratchDirectory
 from protocol.slave import StartValue
 from protocol.standard_output import guarded_standard_output, output_of_others
+from protocol.threads import start_thread
 from protocol.toml_text import toml_value
 
 if TYPE_CHECKING:
@@ -250,11 +252,12 @@ def check(  # noqa: PLR0917  options of the command line
     )
     if name:
         check_name(name)
-    bus = ZenohBus(endpoints, timeout=timeout)
-    try:
-        check_alive(bus, name, agent=agent)
-    finally:
-        bus.close()
+    with interruptible():
+        bus = ZenohBus(endpoints, timeout=timeout)
+        try:
+            check_alive(bus, name, agent=agent)
+        finally:
+            bus.close()
 
 
 @app.command()
@@ -377,8 +380,9 @@ def certificates(
     from slave_node.certificates import Host, make_certificates  # noqa: PLC0415
 
     hosts = [Host.parse(text) for text in host]
-    for path in make_certificates(directory, hosts, role or [Role.SLAVE], days):
-        typer.echo(path)
+    with interruptible():
+        for path in make_certificates(directory, hosts, role or [Role.SLAVE], days):
+            typer.echo(path)
 
 
 @app.command()
@@ -390,7 +394,7 @@ def inspect(
     from slave_node.inspection import description_tables  # noqa: PLC0415
     from slave_node.loading import describe_model  # noqa: PLC0415
 
-    with output_of_others():
+    with interruptible(), output_of_others():
         description = describe_model(model, Path.cwd())
     if as_json:
         typer.echo(json.dumps(_finite(asdict(description)), indent=2))
@@ -417,7 +421,7 @@ def validate(
 
     findings = []
     if as_json:
-        with output_of_others():
+        with interruptible(), output_of_others():
             findings = list(trials(model, Path.cwd(), step_size, timeout=timeout))
         typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
     else:
@@ -425,7 +429,7 @@ def validate(
 
         from slave_node.inspection import report_table  # noqa: PLC0415
 
-        with Console(stderr=True).status("trying"), output_of_others():
+        with interruptible(), Console(stderr=True).status("trying"), output_of_others():
             findings = list(trials(model, Path.cwd(), step_size, timeout=timeout))
         Console().print(report_table(model, findings))
     if not is_usable(findings):
@@ -491,7 +495,7 @@ def _end_on_signals(end: Callable[[str], None]) -> None:
     """On a thread, because the one that gets the signal may hold any lock."""
 
     def handle(number: int, _: FrameType | None) -> None:
-        threading.Thread(target=end, args=(signal.Signals(number).name,), daemon=True).start()
+        start_thread(lambda: end(signal.Signals(number).name), "end")
 
     for number in ending_signals():
         signal.signal(number, handle)
@@ -505,7 +509,7 @@ def _end_with_parent(end: Callable[[str], None]) -> None:
             pass
         end("who started this slave is done or gone")
 
-    threading.Thread(target=watch, name="parent", daemon=True).start()
+    start_thread(watch, "parent")
 
 
 def main() -> None:

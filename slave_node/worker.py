@@ -27,6 +27,7 @@ from protocol.codec import decode_program, decode_reply, encode_error, encode_pr
 from protocol.errors import (
     DeadlineError,
     DoublestepError,
+    HostLimitError,
     MalformedMessageError,
     SlaveCrashedError,
     SlaveKilledError,
@@ -35,6 +36,7 @@ from protocol.logs import LogFormat, configure_logs
 from protocol.python_processes import restore_path, safe_path
 from protocol.scratch import ScratchDirectory
 from protocol.slave import CallExecutor, SlaveDescription, StartValue
+from protocol.threads import LIMITS, start_thread
 from slave_node.deaths import OWN_FAILURE, death, how_ended
 from slave_node.pipe import Pipe
 
@@ -140,10 +142,16 @@ class WorkerProcess:
         self._process = context.Process(
             target=_main, args=(theirs, self._reference, str(self._scratch.path)), daemon=True
         )
-        with safe_path():
-            self._process.start()
-        theirs.close()
-        self._guard = _start_guard(self._process, self._pipe)
+        try:
+            with safe_path():
+                self._process.start()
+            self._guard = _start_guard(self._process, self._pipe)
+        except (OSError, HostLimitError) as error:
+            self._process = self._process if self._process.pid is not None else None
+            self._discard()
+            raise _no_process(error) from error
+        finally:
+            theirs.close()
         try:
             if not self._pipe.has_message(self._load_time):
                 raise DeadlineError(
@@ -236,6 +244,12 @@ class WorkerProcess:
         (process if self._guard is None else self._guard).join(timeout)
 
 
+def _no_process(error: OSError | HostLimitError) -> HostLimitError:
+    if isinstance(error, HostLimitError):
+        return error
+    return HostLimitError(f"no process for the model can be started: {error}", remedy=LIMITS)
+
+
 def _start_guard(process: BaseProcess, pipe: Pipe) -> threading.Thread | None:
     """Look after what a model has started: it ends with the worker.
 
@@ -243,9 +257,8 @@ def _start_guard(process: BaseProcess, pipe: Pipe) -> threading.Thread | None:
     """
     if sys.platform != "linux" or process.pid is None:
         return None
-    guard = threading.Thread(target=_end_with, args=(process.pid, pipe), name="guard", daemon=True)
-    guard.start()
-    return guard
+    worker = process.pid
+    return start_thread(lambda: _end_with(worker, pipe), "guard")
 
 
 def _end_with(worker: int, pipe: Pipe) -> None:

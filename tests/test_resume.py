@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from typing_extensions import TypeAliasType
 
-from master_node import Result, System, load_system, resume, simulate
+from master_node import Result, System, load_system, open_system, resume, simulate
 from master_node.controlled_run import Position
 from master_node.numerics.discontinuities import Bracket
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
@@ -170,6 +170,42 @@ def test_parquet_alone(tmp_path: Path) -> None:
     assert result.outputs.tobytes() == whole.outputs.tobytes()
     files = {path.name for path in (tmp_path / "parts").iterdir()}
     assert files == {"results.parquet", "steps.csv", "summary.json"}
+
+
+OUTER = """<?xml version="1.0" encoding="UTF-8"?>
+<ssd:SystemStructureDescription version="1.0" name="outer"
+  xmlns:ssd="http://ssp-standard.org/SSP1/SystemStructureDescription">
+  <ssd:System name="outer"><ssd:Elements>
+    <ssd:Component name="car" type="application/x-ssp-package" source="inner.ssp"/>
+  </ssd:Elements></ssd:System>
+</ssd:SystemStructureDescription>
+"""
+
+
+@pytest.mark.parametrize("kind", ["a package", "a description that names a package"])
+@pytest.mark.parametrize("when", ["behind a checkpoint", "before the first one"])
+def test_what_was_unpacked_is_unpacked_again(
+    kind: str, when: str, tmp_path: Path, quarter_car_ssp: Path
+) -> None:
+    """The folder of the first time is gone; the models are found in that of the second time."""
+    shutil.copy(quarter_car_ssp, tmp_path / "inner.ssp")
+    (tmp_path / "outer.ssd").write_text(OUTER)
+    path = tmp_path / ("inner.ssp" if kind == "a package" else "outer.ssd")
+
+    def run(out: str, *observers: Interrupt) -> None:
+        with open_system(path) as opened:
+            system = opened.with_simulation(stop_time=0.3)
+            simulate(system, output=tmp_path / out, in_process=True, observers=observers)
+
+    run("whole")
+    with pytest.raises(InterruptedRunError):
+        run("parts", Interrupt(6))
+    if when == "before the first one":
+        (tmp_path / "parts" / "checkpoint" / "run.zip").unlink()
+    with pytest.raises(InterruptedRunError):
+        resume(tmp_path / "parts", observers=(Interrupt(2),))
+    resume(tmp_path / "parts")
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
 
 
 # ---- The end ------------------------------------------------------------------------------------

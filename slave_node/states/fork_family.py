@@ -12,8 +12,9 @@ import sys
 from contextlib import suppress
 from time import monotonic
 
-from protocol.errors import SlaveCrashedError
+from protocol.errors import HostLimitError, SlaveKilledError
 from protocol.python_processes import python_command
+from protocol.threads import LIMITS
 from slave_node.states.channel import PROCESS, Channel
 from slave_node.states.fork_keeper import OBITUARY
 
@@ -36,7 +37,7 @@ class HolderFamily:
         first_process: its process id.
 
     Raises:
-        SlaveCrashedError: they do not come up.
+        HostLimitError, SlaveKilledError: they do not come up.
     """
 
     def __init__(self) -> None:
@@ -57,7 +58,9 @@ class HolderFamily:
         except OSError as error:
             ours.close()
             os.close(self._obituaries)
-            raise SlaveCrashedError(f"no process for the model can be started: {error}") from error
+            raise HostLimitError(
+                f"no process for the model can be started: {error}", remedy=LIMITS
+            ) from error
         finally:
             theirs.close()
             os.close(obituaries)
@@ -69,7 +72,7 @@ class HolderFamily:
         except (EOFError, OSError):
             ours.close()
             self.close()
-            raise SlaveCrashedError("the process for the model did not come up") from None
+            raise SlaveKilledError("the process for the model did not come up") from None
         (self.first_process,) = PROCESS.unpack(process)
         self._group = self.first_process
 
