@@ -28,6 +28,7 @@ from protocol.calls import (
     GetDiscreteOutputs,
     GetOutputs,
     GetState,
+    Initialize,
     Reset,
     SerializeState,
     SetInputs,
@@ -133,6 +134,9 @@ class CallLog:
         self._marks: dict[int, tuple[int, int]] = {}
         self._kept = _Kept()
         self._candidate: SavedState | None = None
+        self._not_repeating: frozenset[str] = frozenset()
+        self._columns: list[int] = []
+        self._others: frozenset[int] = frozenset()
 
     @property
     def is_running(self) -> bool:
@@ -157,7 +161,7 @@ class CallLog:
     @property
     def present(self) -> LoggedStep:
         """What was done since the last step that is kept."""
-        return LoggedStep(tuple(self._present), digest(self._outputs))
+        return LoggedStep(tuple(self._present), self.digest(self._outputs))
 
     @property
     def state(self) -> SavedState | None:
@@ -168,6 +172,24 @@ class CallLog:
     def first(self) -> int:
         """Number of the first step that is kept."""
         return self._kept.first
+
+    def digest(self, outputs: Sequence[object]) -> bytes:
+        """A short hash of outputs, bit for bit; empty without any.
+
+        Those that are known not to repeat do not count.
+        """
+        if not outputs:
+            return b""
+        hash_ = blake2b(digest_size=_DIGEST_SIZE)
+        for values in outputs:
+            if isinstance(values, np.ndarray):
+                kept = np.delete(values, self._columns, axis=1) if self._columns else values
+                hash_.update(kept.tobytes())
+            else:
+                assert isinstance(values, tuple)
+                others = [value for i, value in enumerate(values) if i not in self._others]
+                hash_.update(repr(tuple(others)).encode())
+        return hash_.digest()
 
     def steps(self, begin: int, end: int | None = None) -> Iterator[LoggedStep]:
         """Those with numbers from ``begin`` on, up to ``end``."""
@@ -191,9 +213,19 @@ class CallLog:
                 self._note_state(call)
             elif kind is Configure or kind is Reset:
                 self._begin_anew(call)
+                if isinstance(call, Configure):
+                    self._not_repeating = frozenset(call.not_repeating)
             elif kind not in _WITHOUT_TRACE:
                 (self._present if self._is_running else self._beginning).append(call)
                 self._is_running = self._is_running or kind is ExitInitializationMode
+                if isinstance(call, Initialize):
+                    self._note_outputs(call)
+
+    def _note_outputs(self, call: Initialize) -> None:
+        names = self._not_repeating
+        self._columns = [i for i, name in enumerate(call.outputs) if name in names]
+        others = enumerate(call.discrete_outputs)
+        self._others = frozenset(i for i, name in others if name in names)
 
     def _begin_anew(self, call: Call) -> None:
         is_reset = type(call) is Reset
@@ -258,16 +290,6 @@ class CallLog:
         kept = [step.to_bytes() if self._is_compact else step for step in steps]
         self._kept = _Kept(first, kept, state)
         self._forget_present()
-
-
-def digest(outputs: Sequence[object]) -> bytes:
-    """A short hash of outputs, bit for bit; empty without any."""
-    if not outputs:
-        return b""
-    hash_ = blake2b(digest_size=_DIGEST_SIZE)
-    for values in outputs:
-        hash_.update(values.tobytes() if isinstance(values, np.ndarray) else repr(values).encode())
-    return hash_.digest()
 
 
 def outputs_of(calls: Sequence[Call], results: Sequence[object]) -> list[object]:

@@ -162,6 +162,7 @@ class CoSimulation:
         outputs = self.outputs
         if outputs is None:
             outputs = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
+        outputs = outputs._replace(y=outputs.y[: scheme.output_rows])
         self.group.restart_statistics()
         statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
         if self.resumed is not None:

@@ -392,6 +392,9 @@ class SlaveSettings(_Table):
             derivatives where the model takes them, else as many substeps as the accuracy needs.
         largest_substep: its node splits steps so that no step of the model is longer [s].
         state: how its state is saved; default: the best way that the model and its host allow.
+        output_derivatives: names of the outputs whose derivatives may be used; default: of all,
+            where the model gives any.
+        uncontrolled: names of the outputs that do not count in ERR.
     """
 
     model: StrictStr | None = None
@@ -412,6 +415,8 @@ class SlaveSettings(_Table):
     input_substeps: Annotated[StrictInt, Field(ge=0, le=10_000)] = 0
     largest_substep: Positive | None = None
     state: Literal["native", "fork", "replay", "none"] | None = None
+    output_derivatives: tuple[StrictStr, ...] | None = None
+    uncontrolled: tuple[StrictStr, ...] = ()
 
     @model_validator(mode="after")
     def _agent_needs_model(self) -> Self:

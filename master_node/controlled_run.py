@@ -8,9 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
+
+from master_node.available_polynomials import AvailablePolynomials
 from master_node.double_step import DoubleStep, DoubleStepper
 from master_node.error_control import ErrorControl, StepError
 from master_node.input_defects import InputDefects
+from master_node.missing_derivatives import MissingDerivatives
 from master_node.numerics.discontinuities import (
     NO_JUMP,
     Bracket,
@@ -111,7 +115,9 @@ class ControlledRun:
         self._searches_changes = settings.discontinuities and coupled.discrete.holds_inputs
         self._stepper = self._make_stepper(context, estimator)
         self._control = self._make_control(context, estimator)
+        self._available = self._make_available(context, estimator)
         self._defects = InputDefects(coupled, scheme)
+        self._missing = MissingDerivatives(coupled, scheme)
         present, past = EXPONENTS[settings.controller]
         self._controller = StepSizeController(
             settings.alpha,
@@ -125,7 +131,7 @@ class ControlledRun:
         )
         self._orders = None
         if settings.order == "auto":
-            self._orders = self._make_orders(context, estimator)
+            self._orders = self._make_orders(context)
 
     def _make_stepper(self, context: RunContext, estimator: ErrorEstimator) -> DoubleStepper:
         return DoubleStepper(context.group, context.coupled, context.scheme, estimator)
@@ -134,13 +140,18 @@ class ControlledRun:
         constants = context.system.simulation.constants
         return ErrorControl(context.coupled, context.scheme, estimator, constants)
 
-    def _make_orders(self, context: RunContext, estimator: ErrorEstimator) -> OrderSelection:
+    def _make_available(
+        self, context: RunContext, estimator: ErrorEstimator
+    ) -> AvailablePolynomials:
+        return AvailablePolynomials(context.scheme.extrapolation, estimator)
+
+    def _make_orders(self, context: RunContext) -> OrderSelection:
         settings = context.system.simulation
         return OrderSelection(
             context.coupled,
             context.scheme,
             control=self._control,
-            estimator=estimator,
+            available=self._available,
             largest=settings.polynomial,
             alpha=settings.alpha,
         )
@@ -179,6 +190,7 @@ class ControlledRun:
         return ""
 
     def _reached(self, position: Position) -> None:
+        self._missing.note(position.outputs.y, position.time)
         self._checkpoints.reached(position, self._results.memory)
 
     def _targets(self) -> Iterator[tuple[float, tuple[DoubleStepTimes, str] | None]]:
@@ -214,8 +226,8 @@ class ControlledRun:
     def _with_initial_step_size(self, position: Position, largest: float) -> Position:
         """The position with H from the behaviour of the slaves there, ``largest`` at most [s]."""
         y, stop = position.outputs.y, self._settings.end
-        scale = self._control.scale(y[0])
-        slope = y[1] if len(y) > 1 else None
+        scale = self._coupled.controlled_scale(self._control.scale(y[0]))
+        slope = np.where(self._scheme.trusts_derivative, y[1], np.nan) if len(y) > 1 else None
         trial = trial_step_size(y[0], slope, scale, stop - self._start)
         deadlines = 0
         for _ in range(_TRIALS):
@@ -229,6 +241,10 @@ class ControlledRun:
                 deadlines += 1
                 if deadlines > 1:
                     raise step.original_error
+            if isinstance(step, FailedStep) and step.missing is not None:
+                self._missing.note(step.missing, times.middle)
+                position = position._replace(history=position.history.without_slopes())
+                continue
             if isinstance(step, DoubleStep):
                 error = self._control.judge(step)
                 if error.norm < _INF:
@@ -247,8 +263,7 @@ class ControlledRun:
         return position._replace(step_size=self._controller.bounded(trial))
 
     def _polynomials(self, position: Position) -> Polynomials:
-        points = self._estimator.available(len(position.history.times))
-        return self._scheme.extrapolation.polynomials(position.order.polynomial, points)
+        return self._available.of(position.order.polynomial, position.history)
 
     # --- one attempt ----------------------------------------------------------------------------
 
@@ -264,8 +279,7 @@ class ControlledRun:
             position.time, wanted, target, first=position.controller.rejected
         )
         times = self._limits.times(self._start, position.time, wanted, target)
-        polynomials = self._polynomials(position)
-        step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
+        position, polynomials, step = self._attempt(position, times)
         if isinstance(step, FailedStep):
             return self._after_failure(position, step, times, polynomials, target)
         error = self._control.judge(step)
@@ -294,6 +308,28 @@ class ControlledRun:
         if error.norm <= 1.0 and not jumps:
             return self._accept(position, step, error, defects)
         return self._reject(position, step, error, defects, target)
+
+    def _attempt(
+        self, position: Position, times: DoubleStepTimes
+    ) -> tuple[Position, Polynomials, DoubleStep | FailedStep]:
+        """One attempt, once more where it says nothing of what comes.
+
+        Without derivatives, where one turns out to be missing at T_n + H: both small steps must
+        have polynomials of the same kind. As it was, where a slave returns early in its first step
+        from a restored state: some do so once because their states lack the past of their event
+        indicators.
+        """
+        polynomials = self._polynomials(position)
+        step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
+        if isinstance(step, FailedStep) and step.has_doubtful_event:
+            self._tell_rejected(times, polynomials, _INF, f"{step.reason} after a restore")
+            step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
+        if isinstance(step, FailedStep) and step.missing is not None:
+            self._missing.note(step.missing, times.middle)
+            self._tell_rejected(times, polynomials, _INF, step.reason)
+            without = position._replace(history=position.history.without_slopes())
+            return self._attempt(without, times)
+        return position, polynomials, step
 
     def _accept(
         self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
@@ -457,8 +493,7 @@ class ControlledRun:
 
     def _cross(self, position: Position, times: DoubleStepTimes, name: str) -> Position | str:
         """The double step over a known event, whatever its error is."""
-        polynomials = self._polynomials(position)
-        step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
+        position, polynomials, step = self._attempt(position, times)
         if isinstance(step, FailedStep):
             following = self._after_failure(position, step, times, polynomials, times.end)
             assert isinstance(following, str)  # such a small step is not made smaller

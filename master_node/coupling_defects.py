@@ -358,6 +358,8 @@ class CouplingDefects:
         sizes: FloatArray | None = None
         for newest in range(min(2, len(history.times) - needed)):
             past = history.before(newest + 1)
+            if self._extrapolation.known(polynomials, past) != polynomials:
+                continue
             span = history.times[newest] - past.times[0]
             foreseen = self._extrapolation.signal(past, polynomials).at(span)
             nodes = self._extrapolation.nodes(past.times, polynomials, past.times[0])

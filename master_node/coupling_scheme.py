@@ -34,7 +34,9 @@ class CouplingScheme:
             they are of use.
         output_rows: 2 when outputs are read with derivatives, else 1.
         input_has_derivative: for each input whether its polynomial may meet derivatives, (n,).
-        has_derivative: for each output whether it is read with its derivative, shape (m,).
+        has_derivative: for each output whether its derivative is read and used, shape (m,).
+        trusts_derivative: for each output whether its derivative, if it is read, says anything,
+            shape (m,).
         feed_through: for each output whether it depends directly on extrapolated inputs, shape
             (m,).
         evaluated: indices of the slaves whose outputs are evaluated again at communication points.
@@ -50,6 +52,7 @@ class CouplingScheme:
     output_rows: int
     input_has_derivative: NDArray[np.bool_]
     has_derivative: NDArray[np.bool_]
+    trusts_derivative: NDArray[np.bool_]
     feed_through: NDArray[np.bool_]
     evaluated: tuple[int, ...]
     output_kinds: tuple[frozenset[int], ...]
@@ -84,14 +87,15 @@ class CouplingScheme:
         feed_through = coupled.feed_through & ~np.isin(
             coupled.output_slave, (*evaluated, *late_slaves)
         )
+        used = [_used_derivatives(part, system) for part in coupled.parts]
         derivative_orders = [
-            min(1, part.description.capabilities.max_output_derivative_order)
-            if wanted.derivative_points
-            else 0
-            for part in coupled.parts
+            int(any(outputs)) if wanted.derivative_points else 0 for outputs in used
         ]
         reads_derivative = np.array(derivative_orders, dtype=bool)[coupled.output_slave]
-        has_derivative = reads_derivative & ~coupled.feed_through & ~coupled.held_feed_through
+        is_used = np.array([one for outputs in used for one in outputs], dtype=bool)
+        has_derivative = (
+            reads_derivative & is_used & ~coupled.feed_through & ~coupled.held_feed_through
+        )
         sequence = (*groups, late_slaves)
         group_of_slave = {slave: i for i, group in enumerate(sequence) for slave in group}
         kinds: list[InputKind] = []
@@ -129,10 +133,19 @@ class CouplingScheme:
                 [kinds[i].has_derivative for i in kind_of_input], dtype=bool
             ),
             has_derivative=has_derivative,
+            trusts_derivative=is_used,
             feed_through=feed_through,
             evaluated=evaluated,
             output_kinds=tuple(slave_kinds[slave] for slave in coupled.output_slave),
         )
+
+
+def _used_derivatives(part: SlavePart, system: System) -> list[bool]:
+    """For each output of a slave whether its derivative may be used."""
+    if not part.description.capabilities.max_output_derivative_order:
+        return [False] * len(part.outputs)
+    given = system.slaves[part.name].output_derivatives
+    return [given is None or name in given for name in part.outputs]
 
 
 def slaves_without_rollback(coupled: CoupledSystem) -> tuple[int, ...]:
@@ -151,7 +164,16 @@ def output_control(coupled: CoupledSystem, system: System) -> OutputControl:
         if slave in without
         or np.isin(coupled.output_slave[coupled.source[part.input_slice]], without).any()
     }
-    owners = list(zip(coupled.output_names, coupled.output_slave.tolist(), strict=True))
+    owners = [
+        (name, slave)
+        for name, slave, counts in zip(
+            coupled.output_names,
+            coupled.output_slave.tolist(),
+            coupled.is_controlled.tolist(),
+            strict=True,
+        )
+        if counts
+    ]
     return OutputControl(
         double_step=tuple(name for name, slave in owners if slave not in without),
         input_defects=tuple(name for name, slave in owners if slave in with_defects),

@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from master_node.available_polynomials import AvailablePolynomials
 from master_node.coupling_defects import CouplingDefects, CouplingError, SingleStep
+from master_node.missing_derivatives import MissingDerivatives
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.extrapolation import (
     CouplingHistory,
@@ -85,7 +87,9 @@ class DefectRun:
         self._limits = step_size_limits(context.system)
         self._crossings = crossings(context.system, self._limits, self._coupled.jumps)
         self._stepper = SingleStepper(context)
+        self._missing = MissingDerivatives(context.coupled, scheme)
         self._coupling = CouplingDefects(context.coupled, scheme, SingleStep(scheme))
+        self._available = AvailablePolynomials(scheme.extrapolation, coupling=self._coupling)
         self._ladder: tuple[InputPolynomial, ...] = ()
         if settings.order == "auto":
             self._ladder = ladder(
@@ -136,6 +140,7 @@ class DefectRun:
 
     def _first_position(self, outputs: Outputs) -> _Position:
         y = outputs.y
+        self._missing.note(y, self._start)
         settings, u = self._settings, self._coupled.inputs_of(y)
         depth = max(settings.polynomial.order + 4 + self._scheme.known_ahead, DEPTH)
         step_size = settings.initial_step_size or self._cautious(y)
@@ -156,15 +161,12 @@ class DefectRun:
         return untried_step_size(
             y[0],
             y[1] if len(y) > 1 and self._scheme.has_derivative.all() else None,
-            self._coupling.scale(y[0]),
+            self._coupled.controlled_scale(self._coupling.scale(y[0])),
             self._settings.end - self._start,
         )
 
     def _bounded(self, step_size: float) -> float:
         return min(self._limits.largest, max(self._limits.smallest, step_size))
-
-    def _polynomials(self, polynomial: InputPolynomial, history: CouplingHistory) -> Polynomials:
-        return self._scheme.extrapolation.polynomials(polynomial, self._coupling.points(history))
 
     # --- one step -------------------------------------------------------------------------------
 
@@ -207,7 +209,7 @@ class DefectRun:
             DoublestepError: a slave is lost, or did not complete the step.
         """
         history = position.history
-        polynomials = self._polynomials(position.order.polynomial, history)
+        polynomials = self._available.of(position.order.polynomial, history)
         step = DoStep(position.time, size, True)
         try:
             outputs = self._stepper.take(history, polynomials, end, step, position.outputs)
@@ -219,6 +221,7 @@ class DefectRun:
             raise unrepeatable(failed, step, remedy) from failed.error
         self._checkpoints.settle()
         y = outputs.y
+        self._missing.note(y, end)
         u = self._coupled.inputs_of(y)
         error = self._coupling.judge(history, polynomials, ((end, u),), y[0])
         following = _Position(history.pushed(end, u), outputs, position.step_size, position.order)
@@ -247,7 +250,7 @@ class DefectRun:
                 / taken
                 for polynomial in self._ladder
                 if abs(polynomial.order - memory.polynomial.order) <= 1
-                and self._is_possible(polynomial, position.history)
+                and self._available.allow(polynomial, position.history)
             }
             memory, _ = prefer(memory, factors)
         largest = max(grows * taken, wanted) if taken < wanted else grows * taken
@@ -259,20 +262,9 @@ class DefectRun:
     ) -> float:
         """H that the defects allow with a polynomial [s]."""
         history = position.history
-        polynomials = self._polynomials(polynomial, history)
+        polynomials = self._available.of(polynomial, history)
         return self._coupling.step_size(
             history, polynomials, position.outputs.y[0], smallest=smallest, largest=largest
-        )
-
-    def _is_possible(self, polynomial: InputPolynomial, history: CouplingHistory) -> bool:
-        """Whether all inputs can have its degree, but for those whose slaves never can."""
-        return all(
-            got.order == min(polynomial.order, kind.max_order)
-            for got, kind in zip(
-                self._polynomials(polynomial, history),
-                self._scheme.extrapolation.kinds,
-                strict=True,
-            )
         )
 
     def _tell(self, attempt: Attempt, reached: Reached, points: Points) -> None:

@@ -193,6 +193,8 @@ class DoubleStepper:
         y_middle = at_middle.y
         d_middle = discrete.filled(at_middle.d, outputs.d)
         pushed = history.pushed(middle, self._coupled.inputs_of(y_middle))
+        if self._scheme.extrapolation.known(polynomials, pushed) != polynomials:
+            raise BrokenOffError(self._without_derivative(y_middle))
         second_piece = Piece(
             second_inputs,
             external_second,
@@ -211,6 +213,13 @@ class DoubleStepper:
             (in_first.end[0], in_second.end[0]),
             (d_middle, discrete.filled(at_end.d, d_middle)),
         )
+
+    def _without_derivative(self, middle: FloatArray) -> FailedStep:
+        """The second small step cannot have the polynomials of the first one."""
+        is_missing = self._scheme.has_derivative & ~np.isfinite(middle[1])
+        name = self._coupled.output_names[int(is_missing.argmax())]
+        reason = f"the derivative of {name} is not finite"
+        return FailedStep("", None, float("nan"), reason, missing=middle)
 
     def _inputs(
         self,

@@ -6,6 +6,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from master_node.coupling_scheme import CouplingScheme
 from master_node.double_step import DoubleStep
@@ -65,7 +66,8 @@ class ErrorControl:
         constants: ``exact`` or ``paper``, see ``numerics/error_estimators.py``.
 
     Attributes:
-        outputs: how many outputs ERR is the mean of.
+        counts: which outputs ERR is the mean of, shape (m,).
+        outputs: how many.
     """
 
     def __init__(
@@ -75,7 +77,7 @@ class ErrorControl:
         estimator: ErrorEstimator,
         constants: str,
     ) -> None:
-        self.outputs = len(coupled.output_names)
+        self._count(coupled.is_controlled)
         self._names = coupled.output_names
         self._absolute_tolerance = coupled.absolute_tolerance
         self._relative_tolerance = coupled.relative_tolerance
@@ -116,15 +118,27 @@ class ErrorControl:
         else:
             norm, index = self._norm(ErrorEstimator.estimate(difference, ratio), scale)
         limiting = self._names[index]
-        if len(step.end) > 1 or not norm < _INF:
-            bad = first_not_finite(step.end)
+        if not norm < _INF:
+            bad = first_not_finite(y)
             if bad is not None:
                 norm, limiting = _INF, f"{self._names[bad]} is not finite"
         return StepError(difference, ratio, scale, norm, limiting)
 
+    def _count(self, counts: NDArray[np.bool_]) -> None:
+        """Let ERR be the mean over these outputs, shape (m,)."""
+        self.counts = counts
+        self.outputs = int(counts.sum())
+        self._counted = None if counts.all() else np.flatnonzero(counts)
+
     def _norm(self, error: FloatArray, scale: FloatArray) -> tuple[float, int]:
         """ERR, and the index of the output with most of it."""
-        return weighted_rms_norm(error, scale)
+        counted = self._counted
+        if counted is None:
+            return weighted_rms_norm(error, scale)
+        if not counted.size:
+            return 0.0, 0
+        norm, index = weighted_rms_norm(error[counted], scale[counted])
+        return norm, int(counted[index])
 
     def scale(self, y: FloatArray) -> FloatArray:
         """ATOL_j + RTOL_j |y_j| of equation (8), shape (m,), unit [y]."""
@@ -205,20 +219,12 @@ class PartialErrorControl(ErrorControl):
         constants: str,
     ) -> None:
         super().__init__(coupled, scheme, estimator, constants)
-        takes_part = ~np.isin(coupled.output_slave, scheme.late_slaves)
-        self._counted = np.flatnonzero(takes_part)
-        self._not_counted = np.flatnonzero(~takes_part)
-        self.outputs = len(self._counted)
+        is_late = np.isin(coupled.output_slave, scheme.late_slaves)
+        self._late = np.flatnonzero(is_late)
+        self._count(coupled.is_controlled & ~is_late)
 
     def scale(self, y: FloatArray) -> FloatArray:
-        """See `ErrorControl`; infinite for outputs that do not count."""
+        """See `ErrorControl`; infinite for outputs of the others."""
         scale = super().scale(y)
-        scale[self._not_counted] = _INF
+        scale[self._late] = _INF
         return scale
-
-    def _norm(self, error: FloatArray, scale: FloatArray) -> tuple[float, int]:
-        counted = self._counted
-        if not counted.size:
-            return 0.0, 0
-        norm, index = weighted_rms_norm(error[counted], scale[counted])
-        return norm, int(counted[index])

@@ -5,6 +5,8 @@ from __future__ import annotations
 from math import ulp
 from typing import NamedTuple
 
+from master_node.available_polynomials import AvailablePolynomials
+from master_node.missing_derivatives import MissingDerivatives
 from master_node.numerics.extrapolation import CouplingHistory, highest
 from master_node.numerics.step_size_controller import fixed_steps
 from master_node.observers import Attempt
@@ -63,6 +65,9 @@ class FixedRun:
         start, stop, h = self._start, self._stop, self._step_size
         wanted = settings.polynomial
         stepper = SingleStepper(context)
+        missing = MissingDerivatives(coupled, scheme)
+        missing.note(outputs.y, start)
+        available = AvailablePolynomials(scheme.extrapolation)
         results = ResultPoints(settings.output_grid, scheme.has_derivative, start, outputs)
         depth, u = wanted.order + 1 + scheme.known_ahead, coupled.inputs_of(outputs.y)
         history = (
@@ -79,7 +84,7 @@ class FixedRun:
             done += 1
             time = history.times[0]
             end, size = self._next(time, done)
-            polynomials = scheme.extrapolation.polynomials(wanted, len(history.times))
+            polynomials = available.of(wanted, history)
             step = DoStep(time, size, True)
             try:
                 outputs = stepper.take(history, polynomials, end, step, outputs)
@@ -89,6 +94,7 @@ class FixedRun:
                     return f"{failed.slave} ended the simulation after t={time!r} s"
                 raise unrepeatable(failed, step, _REMEDY) from failed.error
             context.checkpoints.settle()
+            missing.note(outputs.y, end)
             history = history.pushed(end, coupled.inputs_of(outputs.y))
             reached = (ReachedPoint(end, *outputs),)
             order, slopes = highest(polynomials)

@@ -13,6 +13,7 @@ import numpy as np
 from master_node.configuration import System
 from master_node.discrete_coupling import DiscreteValues, Held, HeldInput
 from master_node.numerics.fixed_point import NoFixedPointError, fixed_point
+from master_node.numerics.norms import first_not_finite
 from master_node.outputs import Outputs, gather
 from master_node.slave_group import Program, SlaveGroup
 from master_node.start_values import start_values
@@ -50,10 +51,11 @@ def initialize(
 
     Returns:
         Outputs at T_0, consistent with the connections: values, shape (1, m), or with a second
-        row of derivatives when one of ``get_outputs`` asks for them (0 where it does not).
+        row of derivatives when one of ``get_outputs`` asks for them (0 where it does not); they
+        need not be finite.
 
     Raises:
-        SlaveError: a slave refused, an output is not finite, or an algebraic loop across slaves
+        SlaveError: a slave refused, a value is not finite, or an algebraic loop across slaves
             did not converge.
     """
     simulation = system.simulation
@@ -70,9 +72,9 @@ def initialize(
     ]
     replies = group.execute_all(programs, start)
     outputs = gather(coupled, replies, 1 + max(get.order for get in get_outputs))
-    finite = np.isfinite(outputs.y).all(axis=0)
-    if not finite.all():
-        name = coupled.output_names[int(np.argmin(finite))]
+    bad = first_not_finite(outputs.y[0])
+    if bad is not None:
+        name = coupled.output_names[bad]
         raise SlaveError(f"{name} is not finite", phase="initialization", time=start)
     return outputs
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from master_node.available_polynomials import AvailablePolynomials
 from master_node.controlled_run import ControlledRun, Position
 from master_node.coupling_defects import CouplingDefects, DoubleStepBeforeLateSlaves
 from master_node.double_step import DoubleStep, DoubleStepper, PartialDoubleStepper
@@ -17,7 +18,7 @@ from master_node.error_control import ErrorControl, PartialErrorControl, StepErr
 from master_node.late_slaves import LateSlaves
 from master_node.numerics.discontinuities import Defects
 from master_node.numerics.error_estimators import ErrorEstimator
-from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial, Polynomials
+from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
 from master_node.numerics.initial_step_size import untried_step_size
 from master_node.numerics.order_control import LARGEST_FACTOR, SMALLEST_FACTOR, Candidate
 from master_node.order_selection import OrderSelection
@@ -64,17 +65,19 @@ class MixedRun(ControlledRun):
         constants = context.system.simulation.constants
         return PartialErrorControl(context.coupled, context.scheme, estimator, constants)
 
-    def _make_orders(self, context: RunContext, estimator: ErrorEstimator) -> OrderSelection:
+    def _make_available(
+        self, context: RunContext, estimator: ErrorEstimator
+    ) -> AvailablePolynomials:
+        return AvailablePolynomials(context.scheme.extrapolation, estimator, self._coupling)
+
+    def _make_orders(self, context: RunContext) -> OrderSelection:
         settings = context.system.simulation
-        return _MixedOrderSelection(context, self._control, estimator, settings, self._coupling)
+        return _MixedOrderSelection(
+            context, self._control, self._available, settings, self._coupling
+        )
 
     def _depth(self, points: int) -> int:
         return super()._depth(points) + 2  # defects are known of the polynomials two points ago
-
-    def _polynomials(self, position: Position) -> Polynomials:
-        history = position.history
-        points = min(self._estimator.available(len(history.times)), self._coupling.points(history))
-        return self._scheme.extrapolation.polynomials(position.order.polynomial, points)
 
     def _with_initial_step_size(self, position: Position, largest: float) -> Position:
         """The position with an H so small that the first step need not be taken back."""
@@ -82,7 +85,7 @@ class MixedRun(ControlledRun):
         untried = untried_step_size(
             y[0],
             y[1] if len(y) > 1 and self._scheme.has_derivative.all() else None,
-            self._coupling.scale(y[0]),
+            self._coupled.controlled_scale(self._coupling.scale(y[0])),
             settings.end - self._start,
         )
         return position._replace(step_size=self._controller.bounded(min(untried, largest)))
@@ -133,7 +136,7 @@ class _MixedOrderSelection(OrderSelection):
         self,
         context: RunContext,
         control: ErrorControl,
-        estimator: ErrorEstimator,
+        available: AvailablePolynomials,
         settings: SimulationSettings,
         coupling: CouplingDefects,
     ) -> None:
@@ -141,23 +144,20 @@ class _MixedOrderSelection(OrderSelection):
             context.coupled,
             context.scheme,
             control=control,
-            estimator=estimator,
+            available=available,
             largest=settings.polynomial,
             alpha=settings.alpha,
         )
         self._coupling = coupling
 
-    def _points(self, history: CouplingHistory) -> int:
-        return min(super()._points(history), self._coupling.points(history))
-
     def _bounds(
         self, candidates: Sequence[Candidate], history: CouplingHistory, step: DoubleStep
     ) -> Mapping[InputPolynomial, float]:
-        taken, points = step.times.first, self._points(history)
+        taken = step.times.first
         return {
             candidate.polynomial: self._coupling.step_size(
                 history,
-                self._scheme.extrapolation.polynomials(candidate.polynomial, points),
+                self._available.of(candidate.polynomial, history),
                 step.end[0],
                 smallest=SMALLEST_FACTOR * taken,
                 largest=LARGEST_FACTOR * taken,

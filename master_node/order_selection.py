@@ -6,14 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from master_node.available_polynomials import AvailablePolynomials
 from master_node.coupling_scheme import CouplingScheme
 from master_node.double_step import DoubleStep
 from master_node.error_control import ErrorControl, StepError
-from master_node.numerics.error_estimators import (
-    ErrorEstimator,
-    node_polynomial,
-    small_steps_integral,
-)
+from master_node.numerics.error_estimators import node_polynomial, small_steps_integral
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial, Nodes, Polynomials
 from master_node.numerics.order_control import (
     NO_BOUNDS,
@@ -36,7 +33,7 @@ class OrderSelection:
         coupled: the system.
         scheme: how its slaves are coupled.
         control: its error control.
-        estimator: for which the history must suffice.
+        available: the polynomials that a history allows.
         largest: the highest polynomial that may be chosen.
         alpha: safety factor of the step size controller.
     """
@@ -47,14 +44,14 @@ class OrderSelection:
         scheme: CouplingScheme,
         *,
         control: ErrorControl,
-        estimator: ErrorEstimator,
+        available: AvailablePolynomials,
         largest: InputPolynomial,
         alpha: float,
     ) -> None:
         self._coupled = coupled
         self._scheme = scheme
         self._control = control
-        self._estimator = estimator
+        self._available = available
         self._alpha = alpha
         kinds = scheme.extrapolation.kinds
         self._ladder = ladder(
@@ -93,7 +90,8 @@ class OrderSelection:
         """
         coupled = self._coupled
         slaves = len(coupled.parts)
-        squares = np.bincount(coupled.output_slave, np.square(error.estimate / error.scale), slaves)
+        weighted = np.square(error.estimate / error.scale)
+        squares = np.bincount(coupled.output_slave, weighted * self._control.counts, slaves)
         magnitudes = input_magnitudes(
             history,
             self._has_derivative,
@@ -111,12 +109,11 @@ class OrderSelection:
             middle=middle - begin,
             end=end - begin,
         )
-        points = self._points(history)
         candidates = [
-            self._next(polynomial, points, history, step_size)
+            self._next(polynomial, history, step_size)
             for polynomial in self._ladder
             if abs(polynomial.order - memory.polynomial.order) <= 1
-            and self._is_possible(polynomial, points)
+            and self._available.allow(polynomial, history)
         ]
         return choose(
             memory,
@@ -129,10 +126,6 @@ class OrderSelection:
             bounds=self._bounds(candidates, history, step),
         )
 
-    def _points(self, history: CouplingHistory) -> int:
-        """Through how many points of ``history`` the next polynomials can go."""
-        return self._estimator.available(len(history.times))
-
     def _bounds(
         self,
         candidates: Sequence[Candidate],  # noqa: ARG002  for systems with more to consider
@@ -142,22 +135,12 @@ class OrderSelection:
         """What bounds H over the present H, apart from the estimated error."""
         return NO_BOUNDS
 
-    def _is_possible(self, polynomial: InputPolynomial, points: int) -> bool:
-        """Whether all inputs can have its degree, but for those whose slaves never can."""
-        extrapolation = self._scheme.extrapolation
-        return all(
-            got.order == min(polynomial.order, kind.max_order)
-            for got, kind in zip(
-                extrapolation.polynomials(polynomial, points), extrapolation.kinds, strict=True
-            )
-        )
-
     def _next(
-        self, polynomial: InputPolynomial, points: int, history: CouplingHistory, step_size: float
+        self, polynomial: InputPolynomial, history: CouplingHistory, step_size: float
     ) -> Candidate:
         """A polynomial over the next double step, were it of the same H."""
         extrapolation, ahead = self._scheme.extrapolation, self._scheme.known_ahead
-        polynomials = extrapolation.polynomials(polynomial, points)
+        polynomials = self._available.of(polynomial, history)
         now = history.times[0]
         grid = (now + 2.0 * step_size, now + step_size, *history.times)
         first = extrapolation.nodes(grid[2 - ahead :], polynomials, now, ahead)

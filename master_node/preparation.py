@@ -6,28 +6,32 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from master_node.configuration import System
 from master_node.configure_slaves import configuration, reconfigure
 from master_node.coupling_scheme import CouplingScheme
-from master_node.examinations import (
-    LADDER,
-    examine,
-    is_to_be_examined,
-    remedy,
-)
+from master_node.examinations import LADDER, examine, is_to_be_examined, remedy
 from master_node.external_resolution import Signals
 from master_node.initialization import initialize
 from master_node.outputs import Outputs
 from master_node.slave_group import SlaveGroup
-from master_node.system import resolve
-from protocol.calls import Configure, Reset
-from protocol.errors import DoublestepError, ModelError
+from master_node.system import CoupledSystem, resolve
+from protocol.calls import Configure, GetOutputs, Reset
+from protocol.errors import (
+    FatalSlaveError,
+    ModelError,
+    SlaveCrashedError,
+    SlaveError,
+    SlaveLostError,
+)
 from protocol.slave import Examination, SlaveDescription, StateKind
 
 log = logging.getLogger("master_node")
 
-_ROUNDS = 4
-"""One for each way to save states."""
+_ROUNDS = 10
+"""For each slave one for each way to save states, two for its inputs, two for clocks among its
+outputs, one for its steps."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,8 @@ class Prepared:
     """Slaves that have shown what they are.
 
     Attributes:
-        system: the settings, with the rules that the slaves' clocks ask for.
+        system: the settings, with the rules that the slaves' clocks ask for, and without the
+            derivatives and tolerances that make no sense.
         descriptions: of the slaves as they are configured now.
         configurations: by slave.
         examinations: by slave, of those that took trial steps: the last one of each.
@@ -77,73 +82,193 @@ def prepare(
     prepared = Prepared(system, descriptions, configurations)
     if system.simulation.estimator == "none" or not system.simulation.examine:
         return prepared
-    names = {name for name, description in descriptions.items() if is_to_be_examined(description)}
-    for _ in range(_ROUNDS):
-        if not names:
-            break
-        prepared, names = _examined(group, prepared, names, signals)
-    return prepared
+    names = {name for name, d in descriptions.items() if is_to_be_examined(d, system)}
+    return _Preparation(group, prepared, signals).result(names) if names else prepared
 
 
-def _examined(
-    group: SlaveGroup, prepared: Prepared, names: set[str], signals: Signals
-) -> tuple[Prepared, set[str]]:
-    """One round; also the slaves that are loaded anew, and so are to be examined again."""
-    system, descriptions = prepared.system, prepared.descriptions
-    coupled = resolve(system, descriptions, signals)
-    scheme = CouplingScheme.of(coupled, system)
-    outputs = initialize(group, coupled, system, scheme.get_outputs)
-    found = examine(group, coupled, system, outputs.y, names)
-    wanted = dict(prepared.configurations)
-    warnings = list(prepared.warnings)
-    for name, finding in found.items():
-        what = remedy(name, finding, descriptions[name], wanted[name], system)
-        for warning in what.warnings:
-            if warning not in warnings:
-                log.warning("%s", warning)
-                warnings.append(warning)
-        wanted[name] = what.configuration
-        if what.step_multiple is not None:
-            system = system.with_slave(name, step_multiple=what.step_multiple)
-    changed = {name for name in names if wanted[name] != prepared.configurations[name]}
-    examinations = dict(prepared.examinations)
-    examinations |= {name: finding.examination for name, finding in found.items()}
-    prepared = replace(prepared, system=system, examinations=examinations, warnings=tuple(warnings))
-    if not changed and all(finding.is_harmless for finding in found.values()):
-        return replace(prepared, outputs=outputs), set()
-    _reset(group, float(system.simulation.start_time))
-    descriptions, wanted = _loaded(group, descriptions, wanted, changed)
-    again = {name for name in changed if descriptions[name].state_kind is not StateKind.NONE}
-    return replace(prepared, descriptions=descriptions, configurations=wanted), again
+class _Preparation:
+    """Rounds of trial steps, until nothing more is to be done about any slave.
 
+    Args:
+        group: the slaves, instantiated.
+        prepared: as they are configured.
+        signals: what drives the external inputs.
+    """
 
-def _reset(group: SlaveGroup, time: float) -> None:
-    try:
-        group.execute_all([(Reset(),)] * len(group), time)
-    except DoublestepError as error:
-        error.remedy = error.remedy or "leave the trial steps out: [simulation] examine = false"
-        raise
+    def __init__(self, group: SlaveGroup, prepared: Prepared, signals: Signals) -> None:
+        self._group = group
+        self._prepared = prepared
+        self._signals = signals
+        self._first: Outputs | None = None
+        self._were_reset: set[str] = set()
+        self._loads: set[str] = set()
 
-
-def _loaded(
-    group: SlaveGroup,
-    descriptions: Mapping[str, SlaveDescription],
-    wanted: Mapping[str, Configure],
-    changed: set[str],
-) -> tuple[dict[str, SlaveDescription], dict[str, Configure]]:
-    """Load slaves anew; where a way to save states is not to be had, with the next one."""
-    loaded, configurations = dict(descriptions), dict(wanted)
-    for name in sorted(changed, key=group.names.index):
-        while True:
-            try:
-                loaded |= reconfigure(group, {name: configurations[name]})
+    def result(self, names: set[str]) -> Prepared:
+        """The slaves at T_0, after these were examined."""
+        for _ in range(_ROUNDS):
+            outputs = self._initialized()
+            if not names:
                 break
-            except ModelError as error:
-                kind = configurations[name].state_kind
-                if not kind or kind == StateKind.NONE:
+            found, changed = self._examined(names, outputs)
+            if not changed and not any(examination.has_moved for examination in found.values()):
+                break
+            self._begin_anew()
+            names = self._loaded(changed)
+        else:
+            outputs = self._initialized()
+        return replace(self._prepared, outputs=outputs)
+
+    def _say(self, warning: str) -> None:
+        if warning not in self._prepared.warnings:
+            log.warning("%s", warning)
+            warnings = (*self._prepared.warnings, warning)
+            self._prepared = replace(self._prepared, warnings=warnings)
+
+    # ---- Beginnings -----------------------------------------------------------------------------
+
+    def _initialized(self) -> Outputs:
+        """Outputs at T_0: the same each time, or a slave's reset is broken."""
+        while True:
+            system = self._prepared.system
+            coupled = resolve(system, self._prepared.descriptions, self._signals)
+            scheme = CouplingScheme.of(coupled, system)
+            try:
+                outputs = initialize(self._group, coupled, system, scheme.get_outputs)
+            except (SlaveLostError, SlaveCrashedError, FatalSlaveError):
+                raise
+            except SlaveError as error:
+                if self._goes_on_without_derivatives(error, scheme):
+                    continue
+                if error.slave not in self._were_reset:
                     raise
-                following = LADDER[LADDER.index(StateKind(kind)) + 1]
-                log.warning("%s: no saved states by %s: %s", name, kind, error.cause)
-                configurations[name] = replace(configurations[name], state_kind=following)
-                group.execute([(Reset(),)], slaves=[group.names.index(name)])
-    return loaded, configurations
+                broken = {error.slave: f"{error.phase}: {error.cause}"}
+            else:
+                if self._first is None:
+                    self._first = outputs
+                different = self._beginning_elsewhere(coupled, outputs)
+                broken = dict.fromkeys(different, "its outputs at the start are others than before")
+                if not broken:
+                    return outputs
+            for name, reason in broken.items():
+                self._say(_broken_reset(name, reason))
+            self._loads |= broken.keys()
+            self._begin_anew()
+
+    def _goes_on_without_derivatives(self, error: SlaveError, scheme: CouplingScheme) -> bool:
+        """Whether a slave refused its output derivatives, without which all begins anew."""
+        reads = dict(zip(self._group.names, scheme.get_outputs, strict=True))
+        if error.phase != GetOutputs.verb or not reads[error.slave].order:
+            return False
+        self._say(f"{error.slave}: its output derivatives are not used: {error.cause}")
+        system = self._prepared.system.with_slave(error.slave, output_derivatives=())
+        self._prepared = replace(self._prepared, system=system)
+        self._begin_anew()
+        return True
+
+    def _beginning_elsewhere(self, coupled: CoupledSystem, outputs: Outputs) -> set[str]:
+        """The slaves that were reset and have other outputs now, nearest to where it begins."""
+        first = self._first
+        assert first is not None
+        levels = coupled.initialization
+        keys = [(part.name, output) for part in coupled.parts for output in part.outputs]
+        of_level: dict[int, set[tuple[str, str]]] = {}
+        for index in np.flatnonzero(outputs.y[0] != first.y[0]).tolist():
+            level = int(levels.levels[index]) if levels.levels.size else 0
+            of_level.setdefault(level, set()).add(keys[index])
+        for index, (one, other) in enumerate(zip(outputs.d, first.d, strict=True)):
+            if one != other:
+                level = int(levels.discrete_levels[index]) if levels.discrete_levels.size else 0
+                of_level.setdefault(level, set()).add(coupled.discrete.keys[index])
+        not_repeating = {
+            (name, output)
+            for name, configured in self._prepared.configurations.items()
+            for output in configured.not_repeating
+        }
+        for _, outputs_there in sorted(of_level.items()):
+            slaves = {name for name, _ in outputs_there - not_repeating}
+            if slaves & self._were_reset:
+                return slaves & self._were_reset
+        return set()
+
+    def _begin_anew(self) -> None:
+        """Bring all slaves back to where they were instantiated."""
+        time = float(self._prepared.system.simulation.start_time)
+        names = self._group.names
+        programs = [(Reset(loads=name in self._loads),) for name in names]
+        replies = self._group.execute(programs, time)
+        self._were_reset = {name for name in names if name not in self._loads}
+        for number, (name, reply) in enumerate(zip(names, replies, strict=True)):
+            if reply.error is None:
+                continue
+            (again,) = self._group.execute([(Reset(loads=True),)], time, slaves=[number])
+            if name in self._loads or again.error is not None:
+                error = reply.error
+                error.remedy = error.remedy or _REMEDY
+                raise error
+            self._say(_broken_reset(name, reply.error.cause))
+            self._loads.add(name)
+            self._were_reset.discard(name)
+
+    # ---- Trial steps ----------------------------------------------------------------------------
+
+    def _examined(
+        self, names: set[str], outputs: Outputs
+    ) -> tuple[dict[str, Examination], dict[str, Configure]]:
+        """What these slaves showed, and the configurations that it calls for, where they change."""
+        prepared = self._prepared
+        system, descriptions = prepared.system, prepared.descriptions
+        configurations = prepared.configurations
+        coupled = resolve(system, descriptions, self._signals)
+        found = examine(
+            self._group,
+            coupled,
+            system,
+            outputs.y[0],
+            {name: configurations[name] for name in names},
+        )
+        changed = {}
+        for name in (name for name in self._group.names if name in found):
+            what = remedy(name, found[name], descriptions[name], configurations[name], system)
+            for warning in what.warnings:
+                self._say(warning)
+            if what.configuration != configurations[name]:
+                changed[name] = what.configuration
+            if what.settings:
+                system = system.with_slave(name, **what.settings)
+        examinations = {**prepared.examinations, **found}
+        self._prepared = replace(self._prepared, system=system, examinations=examinations)
+        return found, changed
+
+    def _loaded(self, wanted: Mapping[str, Configure]) -> set[str]:
+        """Load slaves anew; where there is no such way to save states, with the next one.
+
+        Returns:
+            Those that are to be examined as they are now.
+        """
+        prepared, group = self._prepared, self._group
+        loaded, configurations = dict(prepared.descriptions), dict(prepared.configurations)
+        for name in sorted(wanted, key=group.names.index):
+            configured = wanted[name]
+            while True:
+                try:
+                    loaded |= reconfigure(group, {name: configured})
+                    break
+                except ModelError as error:
+                    kind = configured.state_kind
+                    if not kind or kind == StateKind.NONE:
+                        raise
+                    following = LADDER[LADDER.index(StateKind(kind)) + 1]
+                    log.warning("%s: no saved states by %s: %s", name, kind, error.cause)
+                    configured = replace(configured, state_kind=following)
+                    group.execute([(Reset(),)], slaves=[group.names.index(name)])
+            configurations[name] = configured
+            self._were_reset.discard(name)
+        self._prepared = replace(prepared, descriptions=loaded, configurations=configurations)
+        return {name for name in wanted if is_to_be_examined(loaded[name], prepared.system)}
+
+
+def _broken_reset(name: str, reason: str) -> str:
+    return f"{name}: its reset is broken: {reason}; it is loaded anew instead"
+
+
+_REMEDY = "leave the trial steps out: [simulation] examine = false"

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from time import monotonic
 
-from master_node.call_log import CallLog, LoggedStep, SavedState, digest, outputs_of, steps_taken
+from master_node.call_log import CallLog, LoggedStep, SavedState, outputs_of, steps_taken
 from master_node.slave_link import SlaveLink
 from protocol.calls import (
     Call,
@@ -346,10 +346,10 @@ class RestorableSlave:
     def _deserialize(link: SlaveLink, state: SavedState) -> None:
         _execute(link, (DeserializeState(_STATE, state.data), SetState(_STATE), FreeState(_STATE)))
 
-    @staticmethod
-    def _replay(link: SlaveLink, steps: Iterable[LoggedStep]) -> None:
+    def _replay(self, link: SlaveLink, steps: Iterable[LoggedStep]) -> None:
         for step in steps:
-            if digest(outputs_of(step.calls, _execute(link, step.calls))) != step.digest:
+            outputs = outputs_of(step.calls, _execute(link, step.calls))
+            if self.log.digest(outputs) != step.digest:
                 raise _NotRestoredError(_OTHER_OUTPUTS)
 
     def _restarted(self) -> SlaveLink:

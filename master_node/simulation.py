@@ -248,11 +248,14 @@ def _co_simulation(  # noqa: PLR0917  what a run is made of
         store = resumption.store
     elif directory is not None and _writes_checkpoints(given):
         store = CheckpointStore(directory, saved_system(given, mode, slaves.descriptions))
-    keepers: list[Observer] = [] if recording is None else [recording]
+    settings = settings_of(prepared.system, prepared.descriptions)
+    settings["examinations"] = as_plain_data(prepared.examinations)
+    keepers: list[Observer] = []
+    if recording is not None:
+        recording.set_settings(settings)
+        keepers.append(recording)
     writer = None
     if directory is not None:
-        settings = settings_of(prepared.system, prepared.descriptions)
-        settings["examinations"] = as_plain_data(prepared.examinations)
         rows = None if resumed is None else resumed.rows
         writer = ResultsWriter(directory, settings, rows, can_resume=store is not None)
         keepers.append(writer)

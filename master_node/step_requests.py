@@ -57,6 +57,9 @@ class FailedStep:
         error: of the slave, if it returned one.
         step: that was not completed; None when it was a value that is not finite.
         time: where the slave stands [s]; NaN when unknown.
+        missing: outputs at T_n + H, shape (rows, m), of which a derivative is not finite that the
+            second small step needs, as the first one had polynomials with derivatives; else None.
+        follows_restore: whether the step was the first one from a restored state.
     """
 
     slave: str
@@ -66,6 +69,13 @@ class FailedStep:
     error: DoublestepError | None = None
     step: DoStep | None = None
     time: float = _NAN
+    missing: FloatArray | None = None
+    follows_restore: bool = False
+
+    @property
+    def has_doubtful_event(self) -> bool:
+        """Whether the slave returned early in a step that it may complete when it is repeated."""
+        return self.status is StepStatus.EARLY_RETURN and self.follows_restore
 
     @property
     def has_crashed(self) -> bool:
@@ -244,7 +254,8 @@ class StepRequests:
         return [Outputs(values[:, :width], first), Outputs(values[:, width:], second)]
 
     def _check_values(self, values: FloatArray) -> None:
-        bad = first_not_finite(values)
+        """Values only: a derivative that is not finite is none."""
+        bad = first_not_finite(values[..., 0, :])
         if bad is not None:
             reason = f"{self._names[bad % len(self._names)]} is not finite"
             raise BrokenOffError(FailedStep("", None, _NAN, reason))
@@ -358,4 +369,14 @@ def _failure(slave: str, program: Program, reply: Reply) -> FailedStep:
     assert isinstance(result, StepResult)
     reached = (result.time - call.communication_point) / call.step_size
     reason = f"{slave}: {result.status}"
-    return FailedStep(slave, result.status, reached, reason, step=call, time=result.time)
+    done = program[: len(reply.results) - 1]
+    last = next((type(c) for c in reversed(done) if isinstance(c, DoStep | SetState)), None)
+    return FailedStep(
+        slave,
+        result.status,
+        reached,
+        reason,
+        step=call,
+        time=result.time,
+        follows_restore=last is SetState,
+    )

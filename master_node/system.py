@@ -138,6 +138,7 @@ class CoupledSystem:
         feed_through: whether an output depends directly on a connected input, shape (m,).
         absolute_tolerance: ATOL_j, scaled by the nominal values, shape (m,), unit [y].
         relative_tolerance: RTOL_j, shape (m,).
+        is_controlled: whether an output counts in ERR, shape (m,).
         initialization, at_point: the order in which values propagate through the slaves in
             initialization mode and at a communication point.
         discrete: all connections and outputs that are not continuous.
@@ -156,6 +157,7 @@ class CoupledSystem:
     feed_through: NDArray[np.bool_]
     absolute_tolerance: FloatArray
     relative_tolerance: FloatArray
+    is_controlled: NDArray[np.bool_]
     initialization: FeedThroughOrder
     at_point: FeedThroughOrder
     discrete: DiscreteCoupling
@@ -185,6 +187,10 @@ class CoupledSystem:
             u *= self.factor
             u[0 if u.ndim > 1 else ...] += self.offset
         return u
+
+    def controlled_scale(self, scale: FloatArray) -> FloatArray:
+        """Tolerances of outputs, shape (m,), infinite for those that do not count in ERR."""
+        return np.where(self.is_controlled, scale, np.inf)
 
     def scale_of_inputs(self, scale: FloatArray) -> FloatArray:
         """Tolerances of inputs, shape (n,), unit [u], from those of outputs, (m,), unit [y]."""
@@ -216,9 +222,15 @@ def resolve(
     }
     everything = [(slave, variable) for slave in outputs for variable in outputs[slave]]
     output_index = {(slave, variable.name): i for i, (slave, variable) in enumerate(everything)}
-    if not output_index and system.simulation.estimator != "none":
+    is_controlled = np.array(
+        [v.name not in system.slaves[slave].uncontrolled for slave, v in everything], dtype=np.bool_
+    )
+    if not is_controlled.any() and system.simulation.estimator != "none":
+        message = "no slave has a continuous real output: there is nothing to control"
+        if output_index:
+            message = "all outputs are uncontrolled: there is nothing to control"
         raise ConfigurationError(
-            f"{system.source}: no slave has a continuous real output: there is nothing to control",
+            f"{system.source}: {message}",
             remedy="use --estimator none with a fixed --step-size",
         )
     feeding: dict[str, dict[str, ScalarConnection]] = {name: {} for name in descriptions}
@@ -257,6 +269,7 @@ def resolve(
         feed_through=_depends(parts, {part.name: part.connected for part in parts}),
         absolute_tolerance=np.array([absolute for absolute, _ in tolerances]),
         relative_tolerance=np.array([relative for _, relative in tolerances]),
+        is_controlled=is_controlled,
         initialization=_feed_through_order(output_index, discrete, initial, feeding),
         at_point=_feed_through_order(output_index, discrete, direct, feeding),
         discrete=discrete,
@@ -336,6 +349,17 @@ def _check_slave_tables(system: System, finder: VariableFinder) -> None:
             (system.places.parameter, settings.parameters, finder.names(slave)),
             (system.places.tolerance, settings.tolerances, outputs),
         ]
+        lists = {
+            "output_derivatives": settings.output_derivatives or (),
+            "uncontrolled": settings.uncontrolled,
+        }
+        for key, listed in lists.items():
+            for name in listed:
+                if name not in outputs:
+                    raise ConfigurationError(
+                        f"{system.source}: [slaves.{slave}] {key}: no output {name!r}"
+                        f"{nearest(name, outputs)}"
+                    )
         for place, given, known in tables:
             names = frozenset(known)
             for name in given:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
-from protocol.signals import FloatArray
+from protocol.signals import MAX_ORDER, FloatArray
 
 if TYPE_CHECKING:
     from protocol.errors import DoublestepError
@@ -36,6 +36,10 @@ class Configure:
             are split. None: they are not.
         input_substeps: into how many substeps a communication step is split where polynomial
             inputs are emulated; 0: as many as the accuracy needs.
+        max_input_order: highest order of input derivatives that the model is to be given, where it
+            takes any: polynomials of higher degree are emulated with pieces of this degree.
+        not_repeating: names of outputs that do not repeat, such as clocks: what they give is
+            compared with nothing.
     """
 
     verb: ClassVar[str] = "configure"
@@ -43,6 +47,8 @@ class Configure:
     structural_parameters: Mapping[str, StartValue] = field(default_factory=dict)
     largest_substep: float | None = None
     input_substeps: int = 0
+    max_input_order: int = MAX_ORDER
+    not_repeating: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +90,19 @@ class ExitInitializationMode:
 class Examine:
     """Take trial steps and go back: can the slave be trusted? Result: `Examination`.
 
-    Unless its verdict is ``exact`` the slave need not stand where it stood: reset it then.
+    Where the answer says that it has moved, the slave need not stand where it stood: reset it then.
 
     Attributes:
         communication_point: where the slave stands [s].
-        step_size: of the trial steps [s].
+        step_size: of the trial steps that show whether saved states can be trusted [s].
         relative_tolerance, absolute_tolerance: of the coupling; weights for differences.
+        largest_step: no trial step is longer [s]; None: 32 of ``step_size``.
+        inputs: values of the continuous inputs, in the order of `SetInputs`; empty: they stay.
+        input_changes: by how much each of them may be moved in a trial step.
+        input_order: highest order of input derivatives to try.
+        output_derivatives: whether those of the outputs are of interest.
+        connected: names of the outputs on which other slaves depend.
+        not_repeating: names of outputs that are known not to repeat, see `Configure`.
     """
 
     verb: ClassVar[str] = "examine"
@@ -97,6 +110,13 @@ class Examine:
     step_size: float
     relative_tolerance: float = 1e-4
     absolute_tolerance: float = 1e-4
+    largest_step: float | None = None
+    inputs: tuple[float, ...] = ()
+    input_changes: tuple[float, ...] = ()
+    input_order: int = 0
+    output_derivatives: bool = True
+    connected: tuple[str, ...] = ()
+    not_repeating: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,9 +231,14 @@ class Terminate:
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """fmi2Reset: back to the state after instantiation; saved states are freed. Result: None."""
+    """fmi2Reset: back to the state after instantiation; saved states are freed. Result: None.
+
+    Attributes:
+        loads: load the model anew instead, where its own reset is broken.
+    """
 
     verb: ClassVar[str] = "reset"
+    loads: bool = False
 
 
 Call = (

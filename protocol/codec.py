@@ -66,6 +66,7 @@ from protocol.calls import (
     GetState,
     Initialize,
     Reply,
+    Reset,
     SerializeState,
     SetDiscreteInputs,
     SetInputs,
@@ -232,6 +233,12 @@ def _texts(value: Any, what: str) -> tuple[str, ...]:
     raise MalformedMessageError(f"{what} must be a list of strings, not {_shown(value)}")
 
 
+def _numbers(value: Any, what: str) -> tuple[float, ...]:
+    if type(value) is list and len(value) <= MAX_COLUMNS:
+        return tuple(_number(item, what) for item in value)
+    raise MalformedMessageError(f"{what} must be a list of numbers, not {_shown(value)}")
+
+
 def _start_value(value: Any, what: str) -> StartValue:
     if type(value) in _VALUE_TYPES:
         return value  # type: ignore[no-any-return]
@@ -259,6 +266,10 @@ def _start_values(value: Any, what: str) -> dict[str, StartValue]:
     return {name: _start_value(item, what) for name, item in _mapping(value, what).items()}
 
 
+def _texts_by_name(value: Any, what: str) -> dict[str, str]:
+    return {name: _text(item, what) for name, item in _mapping(value, what).items()}
+
+
 def _dependencies(value: Any, what: str) -> dict[str, tuple[str, ...]]:
     return {name: _texts(item, what) for name, item in _mapping(value, what).items()}
 
@@ -273,6 +284,8 @@ _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
         "structural_parameters": _start_values,
         "largest_substep": _optional_number,
         "input_substeps": _integer,
+        "max_input_order": _integer,
+        "not_repeating": _texts,
     },
     Initialize: {
         "start_time": _number,
@@ -290,6 +303,13 @@ _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
         "step_size": _number,
         "relative_tolerance": _number,
         "absolute_tolerance": _number,
+        "largest_step": _optional_number,
+        "inputs": _numbers,
+        "input_changes": _numbers,
+        "input_order": _integer,
+        "output_derivatives": _boolean,
+        "connected": _texts,
+        "not_repeating": _texts,
     },
     SetInputs: {"derivatives": _array},
     SetDiscreteInputs: {"values": _values},
@@ -304,6 +324,7 @@ _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
     FreeState: {"state": _integer},
     SerializeState: {"state": _integer},
     DeserializeState: {"state": _integer, "data": _binary},
+    Reset: {"loads": _boolean},
 }
 _CALL_BY_VERB: Mapping[str, type[Call]] = {cls.verb: cls for cls in CALLS}
 
@@ -777,10 +798,16 @@ _DESCRIPTION_FIELDS: Mapping[str, _Check] = {
 _EXAMINATION_FIELDS: Mapping[str, _Check] = {
     "state_verdict": lambda value, _: _member(StateVerdict, value),
     "state_reason": _text,
+    "has_moved": _boolean,
     "difference": _number,
     "internal_clock": _optional_number,
     "step_dependence": _number,
     "largest_substep": _optional_number,
+    "input_order": lambda value, what: None if value is None else _integer(value, what),
+    "input_refusal": _text,
+    "not_repeating": _texts,
+    "poor_derivatives": _texts_by_name,
+    "not_tried": _text,
 }
 
 
@@ -818,10 +845,6 @@ def encode_error_map(error: DoublestepError) -> bytes:
 
 
 # --- records: agents ----------------------------------------------------------------------------
-
-
-def _texts_by_name(value: Any, what: str) -> dict[str, str]:
-    return {name: _text(item, what) for name, item in _mapping(value, what).items()}
 
 
 def _records(cls: Any, checks: Mapping[str, _Check]) -> _Check:

@@ -104,7 +104,8 @@ class InputDerivatives(StrEnum):
     """How a slave follows polynomial inputs.
 
     ``NATIVE``: the model takes derivatives. ``EMULATED``: its slave node splits each step into
-    substeps with constant inputs. ``NONE``: inputs are constant in each step.
+    substeps, with inputs that are constant in each or of the degree that the model takes. ``NONE``:
+    inputs are constant in each step.
     """
 
     NATIVE = "native"
@@ -251,12 +252,15 @@ class StateVerdict(StrEnum):
     """What a test of saved states showed.
 
     ``EXACT``: bit for bit as without. ``RESTARTS_SOLVER``: steps after a restore repeat, but differ
-    from those without, because the model's solver starts anew. ``DOES_NOT_REPEAT``: steps after a
-    restore differ from each other. ``BROKEN``: a call failed. ``NOT_TESTED``: no state is saved.
+    from those without, within the tolerance, because the model's solver starts anew.
+    ``DOES_NOT_RESTORE``: they differ by more. ``DOES_NOT_REPEAT``: steps after a restore differ
+    from each other. ``BROKEN``: a call failed. ``NOT_TESTED``: no state is saved, or nothing can be
+    said before something else is settled.
     """
 
     EXACT = "exact"
     RESTARTS_SOLVER = "restarts solver"
+    DOES_NOT_RESTORE = "does not restore"
     DOES_NOT_REPEAT = "does not repeat"
     BROKEN = "broken"
     NOT_TESTED = "not tested"
@@ -264,26 +268,40 @@ class StateVerdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """What trial steps of a slave showed; it stands where it stood before, if its states are exact.
+    """What trial steps of a slave showed.
 
     Attributes:
         state_verdict: whether its saved states can be trusted.
         state_reason: what was seen, in words.
-        difference: largest relative difference of an output after a restore, from the same step
-            without one.
+        has_moved: whether the slave need not stand where it stood before.
+        difference: largest difference of an output after a restore from the same step without one,
+            relative to the output or its nominal value.
         internal_clock: the outputs move only at multiples of this [s]; None: no such clock.
         step_dependence: how much a step of 2h differs from two of h, weighted by the tolerance:
             far above 1 if the model takes one step of its own in each do_step.
         largest_substep: steps of the model up to this keep that difference within the tolerance
             [s]; None: there is no need.
+        input_order: highest order of input derivatives that it takes; None: all that were tried.
+        input_refusal: why it takes no higher ones; "" if it does. Nothing else was tried then.
+        not_repeating: outputs that no other slave depends on, and that were others each time the
+            same step was taken, or by each step however short, such as clocks and counters. Unless
+            all of them were known before, nothing else was tried.
+        poor_derivatives: outputs whose derivatives are of no use, with the reason in words.
+        not_tried: what was left out because steps take long, in words.
     """
 
     state_verdict: StateVerdict = StateVerdict.NOT_TESTED
     state_reason: str = ""
+    has_moved: bool = False
     difference: float = 0.0
     internal_clock: float | None = None
     step_dependence: float = 0.0
     largest_substep: float | None = None
+    input_order: int | None = None
+    input_refusal: str = ""
+    not_repeating: tuple[str, ...] = ()
+    poor_derivatives: Mapping[str, str] = field(default_factory=dict)
+    not_tried: str = ""
 
 
 class Slave(ABC):

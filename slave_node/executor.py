@@ -89,13 +89,7 @@ class Executor:
             Configure: self._configure,
             Initialize: self._initialize,
             ExitInitializationMode: lambda _: slave.exit_initialization_mode(),
-            Examine: lambda call: examine(
-                slave,
-                call.communication_point,
-                call.step_size,
-                call.relative_tolerance,
-                call.absolute_tolerance,
-            ),
+            Examine: lambda call: examine(slave, call),
             SetInputs: lambda call: set_inputs(call.derivatives),
             SetDiscreteInputs: lambda call: slave.set_discrete_inputs(call.values),
             DoStep: lambda call: do_step(
@@ -184,18 +178,23 @@ class Executor:
     def _configure(self, call: Configure) -> SlaveDescription:
         """Replace the slave by one that is loaded as the call says; if there is none, by itself."""
         if call != self._configuration:
-            if self._load is None:
-                raise SlaveError(f"{self._slave.description.model} cannot be configured")
-            self._snapshots.clear()
-            self._slave.close()
-            self._is_loaded = False
-            try:
-                self._bind(self._load(call))
-            except ModelError:
-                self._bind(self._load(self._configuration))
-                raise
-            self._configuration = call
+            self._load_anew(call)
         return self._slave.description
+
+    def _load_anew(self, configuration: Configure) -> None:
+        """Replace the slave; where it cannot be loaded so, by one as it was."""
+        if self._load is None:
+            raise SlaveError(f"{self._slave.description.model} cannot be loaded anew")
+        with suppress(SlaveError):
+            self._snapshots.clear()
+        self._slave.close()
+        self._is_loaded = False
+        try:
+            self._bind(self._load(configuration))
+        except ModelError:
+            self._bind(self._load(self._configuration))
+            raise
+        self._configuration = configuration
 
     def _initialize(self, call: Initialize) -> None:
         self._slave.initialize(
@@ -210,6 +209,9 @@ class Executor:
             early_return=call.early_return,
         )
 
-    def _reset(self, _: Reset) -> None:
-        self._snapshots.clear()
-        self._slave.reset()
+    def _reset(self, call: Reset) -> None:
+        if call.loads:
+            self._load_anew(self._configuration)
+        else:
+            self._snapshots.clear()
+            self._slave.reset()

@@ -88,7 +88,10 @@ def load_model(
 
         context = user_context()
         slave = ModelSlave(context.run(_model_class, model, base), context)
-    rest = replace(configuration, largest_substep=None, input_substeps=0)
+    rest = Configure(
+        state_kind=configuration.state_kind,
+        structural_parameters=configuration.structural_parameters,
+    )
     if rest != DEFAULT:
         slave.close()
         raise ModelError(f"{model}: cannot be run as {rest}")

@@ -27,6 +27,7 @@ from protocol.slave import (
 )
 from protocol.step_sums import step_to
 from slave_node.substep_inputs import scaled, substep_values, substeps_needed
+from slave_node.substep_polynomials import piece_polynomials, pieces_needed
 
 DEFAULT = Configure()
 
@@ -47,17 +48,19 @@ def input_derivatives(
 ) -> InputDerivatives:
     """How a model follows polynomial inputs, by itself or with the help of its slave node.
 
-    One without input derivatives is emulated, unless ``input_substeps`` is 1. A number that is
-    given holds for a model with input derivatives too.
+    One without input derivatives, or not of all orders, is emulated, unless ``input_substeps`` is
+    1. A number that is given holds for a model with input derivatives too.
     """
     derivatives = description.input_derivatives
     if not any(v.is_continuous_real for v in description.of(Causality.INPUT)):
         return derivatives
     if configuration.input_substeps == 1:
         return InputDerivatives.NONE
-    if configuration.input_substeps or derivatives is InputDerivatives.NONE:
-        return InputDerivatives.EMULATED
-    return derivatives
+    is_native = derivatives is InputDerivatives.NATIVE
+    takes_all = is_native and configuration.max_input_order >= MAX_ORDER
+    if takes_all and not configuration.input_substeps:
+        return derivatives
+    return InputDerivatives.EMULATED
 
 
 def with_substeps(slave: Slave, configuration: Configure = DEFAULT) -> Slave:
@@ -74,7 +77,10 @@ def with_substeps(slave: Slave, configuration: Configure = DEFAULT) -> Slave:
     number = configuration.input_substeps
     if not description.capabilities.can_handle_variable_step_size and not splits:
         number = number or 1
-    return SubstepSlave(slave, derivatives, number, configuration.largest_substep)
+    degree = 0
+    if description.input_derivatives is InputDerivatives.NATIVE and not number:
+        degree = max(0, min(configuration.max_input_order, MAX_ORDER))
+    return SubstepSlave(slave, derivatives, number, configuration.largest_substep, degree=degree)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,8 +104,9 @@ def _lengths(number: int, *, meets_end: bool) -> tuple[float, ...]:
 class SubstepSlave(Slave):
     """A slave whose communication steps are substeps of another one.
 
-    With emulated input derivatives each substep has constant inputs, see ``substep_inputs.py``;
-    with native ones it has the polynomial around its beginning.
+    With emulated input derivatives each substep has constant inputs, see ``substep_inputs.py``, or
+    lines and parabolas, see ``substep_polynomials.py``; with native ones, and with a polynomial of
+    a degree that the model takes, it has that around its beginning.
 
     A communication step that is a whole number of the model's fixed steps, or of
     ``largest_substep``, is split into just these: so a model with an internal clock stays on it.
@@ -114,6 +121,7 @@ class SubstepSlave(Slave):
         input_derivatives: how it is to follow polynomial inputs.
         number: of substeps where they are emulated; 0: as many as the accuracy needs.
         largest_substep: longest step of the model [s]; None: any.
+        degree: of the polynomials that the model itself takes.
     """
 
     def __init__(
@@ -122,6 +130,8 @@ class SubstepSlave(Slave):
         input_derivatives: InputDerivatives,
         number: int = 0,
         largest_substep: float | None = None,
+        *,
+        degree: int = 0,
     ) -> None:
         self._slave = slave
         self.description: SlaveDescription = replace(
@@ -129,6 +139,7 @@ class SubstepSlave(Slave):
         )
         self._derivatives = input_derivatives
         self._number = number
+        self._degree = degree
         self._fixed = slave.description.fixed_step_size
         self._largest = largest_substep
         self._follows = slave.description.capabilities.outputs_follow_inputs
@@ -208,7 +219,7 @@ class SubstepSlave(Slave):
         elif not 1 <= len(derivatives) <= MAX_ORDER + 1:
             raise SlaveError(f"{len(derivatives)} rows of inputs, not 1 to {MAX_ORDER + 1}")
         else:
-            self._slave.set_inputs(derivatives[:1])
+            self._slave.set_inputs(derivatives[: 1 + self._degree])
         self._inputs = InputSignal(derivatives)
 
     def get_outputs(self, order: int) -> FloatArray:
@@ -231,18 +242,23 @@ class SubstepSlave(Slave):
         """See `Slave`. A substep that does not reach its end ends the step there."""
         begin, end = self._begin(communication_point, step_size), communication_point + step_size
         inputs = self._inputs
-        is_emulated = self._derivatives is InputDerivatives.EMULATED and inputs.order > 0
+        degree = self._degree
+        is_emulated = self._derivatives is InputDerivatives.EMULATED and inputs.order > degree
         rows = scaled(inputs.derivatives, step_size) if is_emulated else None
         number, size, is_free = self._split(rows, step_size)
-        meets_end = is_emulated and self._meets_end and is_free and not self._follows
-        lengths = _lengths(number, meets_end=meets_end)
+        meets_end = is_emulated and self._meets_end and not self._follows
+        meets_end = meets_end and (is_free or degree > 0)  # of pieces the last one can be as it is
+        lengths = _lengths(number, meets_end=meets_end and not degree)
         last = len(lengths) - 1
-        if rows is not None:
-            values = substep_values(rows, lengths, meets_end=meets_end)
+        if rows is not None and degree:
+            values = piece_polynomials(rows, lengths, degree, meets_end=meets_end)
+            values = values / step_size ** np.arange(degree + 1)[:, np.newaxis]
+        elif rows is not None:
+            values = substep_values(rows, lengths, meets_end=meets_end)[:, np.newaxis]
         time, offset = begin, 0.0
         for i, length in enumerate(lengths):
             if rows is not None:
-                self._slave.set_inputs(values[i : i + 1])
+                self._slave.set_inputs(values[i])
             elif i and inputs.order > 0:
                 self._slave.set_inputs(inputs.shifted(time - begin).derivatives)
             offset += length
@@ -257,7 +273,7 @@ class SubstepSlave(Slave):
         if math.isfinite(time):
             self._inputs = inputs.shifted(time - begin)
         if is_emulated and self._meets_end and self._follows and result.status is _OK:
-            self._slave.set_inputs(self._inputs.derivatives[:1])
+            self._slave.set_inputs(self._inputs.derivatives[: 1 + degree])
         return result
 
     def _begin(self, communication_point: float, step_size: float) -> float:
@@ -283,7 +299,11 @@ class SubstepSlave(Slave):
         if self._fixed is not None:
             return 1, step_size, False  # for the model to refuse
         number = 1
-        if rows is not None:
+        if rows is not None and self._degree:
+            number = pieces_needed(
+                rows, self._degree, self._nominal, self._tolerance, meets_end=self._meets_end
+            )
+        elif rows is not None:
             number = self._number or substeps_needed(rows, self._nominal, self._tolerance)
         if self._largest is not None:
             number = max(number, math.ceil(step_size / self._largest))

@@ -6,9 +6,10 @@ The model runs in a process of its own, which is started anew after whatever end
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from math import factorial
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ from protocol.slave import (
     StateVerdict,
     StepStatus,
 )
-from slave_node.examination import LARGEST_STEP
+from slave_node.trials.steps import STEPS
 from slave_node.worker import ModelReference, Worker, WorkerProcess
 
 DEFAULT_STEP_SIZE = 1e-2
@@ -137,7 +138,7 @@ def _description(fmu: Path) -> Finding:
 
 
 class _Trial:
-    """A model that is brought to its first communication point again and again."""
+    """A model that is loaded again and again: what it does to one trial no other one sees."""
 
     def __init__(self, worker: Worker, timeout: float) -> None:
         self._worker = worker
@@ -171,8 +172,8 @@ class _Trial:
             timer.cancel()
 
     def again(self, *calls: Call, configuration: Configure | None = None) -> Reply:
-        """Execute calls on the model as good as new."""
-        if not self._is_fresh and self.run(Reset()).error is not None:
+        """Execute calls on the model as it was loaded."""
+        if not self._is_fresh and self.run(Reset(loads=True)).error is not None:
             self._worker.start()
         self._is_fresh = False
         if configuration is not None:
@@ -202,9 +203,13 @@ class _Validation:
         outputs = description.of(Causality.OUTPUT)
         self._outputs = tuple(v.name for v in outputs if v.is_continuous_real)
         discrete = tuple(v.name for v in outputs if v.is_discrete)
+        self._output_names = (*self._outputs, *discrete)
         self._starts = np.array(
             [[float(self._variables[name].start or 0.0) for name in self._inputs]]
         )
+        self._not_repeating: tuple[str, ...] = ()
+        self._poor: set[str] = set()
+        self._reads_derivatives = True
         self._begin: tuple[Call, ...] = (
             Initialize(inputs=self._inputs, outputs=self._outputs, discrete_outputs=discrete),
             SetInputs(self._starts),
@@ -322,6 +327,9 @@ class _Validation:
             refusal = problem
         else:
             order = 0
+        used = self._highest_order_used(order)
+        if used < order:
+            order, refusal = used, f"those of order {used + 1} change nothing"
         if order == MAX_ORDER:
             return Finding(what, Grade.OK, f"up to order {order}")
         return Finding(
@@ -331,32 +339,56 @@ class _Validation:
             "where higher ones are wanted, inputs are followed in substeps",
         )
 
+    def _highest_order_used(self, order: int) -> int:
+        """Up to which order derivatives change what a step leads to.
+
+        ``order`` too where the inputs change nothing at all.
+        """
+        held = np.zeros((order + 1, len(self._inputs)))
+        held[0] = self._starts[0]
+
+        def behind(inputs: FloatArray) -> bytes:
+            reply = self._trial.again(
+                *self._begin, SetInputs(inputs), DoStep(0.0, self._h), GetOutputs()
+            )
+            outputs = reply.results[-1] if reply.error is None else None
+            return outputs.tobytes() if isinstance(outputs, np.ndarray) else b""
+
+        def is_used(k: int) -> bool:
+            inputs = held.copy()
+            inputs[k] += self._changes() * factorial(k) / self._h**k
+            return behind(inputs) != without
+
+        without = behind(held)
+        if not order or not is_used(0):
+            return order
+        return next((k - 1 for k in range(1, order + 1) if not is_used(k)), order)
+
     def _output_derivatives(self) -> Finding:
         what = "output derivatives"
         if not self._description.capabilities.max_output_derivative_order or not self._outputs:
             return Finding(what, Grade.OK, "none", "input polynomials meet values only")
         if not self._takes_any_step:
             return Finding(what, Grade.OK, "not compared: that takes steps of any size")
-        h = 1e-3 * self._h
         reply = self._trial.again(
-            *self._begin, GetOutputs(1), DoStep(0.0, h), GetOutputs(0), DoStep(h, h), GetOutputs(0)
+            *self._begin,
+            GetOutputs(1),
+            Examine(
+                0.0, self._h, inputs=tuple(self._moved()[0]), input_changes=tuple(self._changes())
+            ),
+            configuration=Configure(state_kind=StateKind.NONE),
         )
-        problem = _failure(reply)
-        if problem is not None:
-            return Finding(what, Grade.NOTE, problem, "leave them out: derivative_points = 0")
-        start, first, second = (r for r in reply.results if isinstance(r, np.ndarray))
-        slope = (-3.0 * start[0] + 4.0 * first[0] - second[0]) / (2.0 * h)
-        nominal = [self._variables[name].nominal for name in self._outputs]
-        scale = np.abs(slope) + np.abs(start[1]) + nominal
-        worst = float(np.max(np.abs(slope - start[1]) / scale))
-        if worst < 0.05:
-            return Finding(what, Grade.OK, "agree with differences", "input polynomials meet them")
-        return Finding(
-            what,
-            Grade.NOTE,
-            f"differ from differences of outputs by {worst:.0%}",
-            "wrong ones cost steps: leave them out with derivative_points = 0",
-        )
+        if reply.error is not None:
+            self._reads_derivatives = False
+            problem = f"{reply.error.phase}: {reply.error.cause}"
+            return Finding(what, Grade.NOTE, problem, "they are not used")
+        examination = reply.results[-1]
+        assert isinstance(examination, Examination)
+        poor = examination.poor_derivatives
+        self._poor = set(poor)
+        if poor:
+            return Finding(what, Grade.NOTE, _reasons(poor), "they are not used")
+        return Finding(what, Grade.OK, "agree with differences", "input polynomials meet them")
 
     def _states(self) -> Iterator[Finding]:
         """Each way to save states, from the model's best one down to the first that can be used."""
@@ -370,12 +402,19 @@ class _Validation:
                     "steps cannot be taken back: its coupling is controlled by input defects",
                 )
                 return
-            reply = self._trial.again(
-                *self._begin,
-                SetInputs(self._moved()),
-                Examine(0.0, self._h),
-                configuration=Configure(state_kind=kind),
-            )
+            reply = self._examined(kind)
+            known = self._not_repeating
+            while set(_clocks(reply)) > set(self._not_repeating):
+                self._not_repeating = _clocks(reply)
+                reply = self._examined(kind)
+            clocks = [n for n in self._output_names if n in {*self._not_repeating} - {*known}]
+            if clocks:
+                yield Finding(
+                    f"outputs that do not repeat, {kind}",
+                    Grade.NOTE,
+                    ", ".join(clocks),
+                    "compared with nothing, and kept out of ERR, if nothing is connected to them",
+                )
             if isinstance(reply.error, DeadlineError):
                 yield Finding(
                     what,
@@ -394,12 +433,31 @@ class _Validation:
             if examination.state_verdict is StateVerdict.NOT_TESTED:
                 return
             if examination.state_verdict in (StateVerdict.EXACT, StateVerdict.RESTARTS_SOLVER):
+                poor = examination.poor_derivatives
+                more = {name: reason for name, reason in poor.items() if name not in self._poor}
+                if more:
+                    what = "output derivatives, going back"
+                    yield Finding(what, Grade.NOTE, _reasons(more), "they are not used")
                 yield from _behaviour(examination, takes_any_step=self._takes_any_step)
                 return
 
+    def _examined(self, kind: StateKind) -> Reply:
+        """Trial steps with states that are saved in this way."""
+        return self._trial.again(
+            *self._begin,
+            SetInputs(self._moved()),
+            Examine(
+                0.0,
+                self._h,
+                output_derivatives=self._reads_derivatives,
+                not_repeating=self._not_repeating,
+            ),
+            configuration=Configure(state_kind=kind, not_repeating=self._not_repeating),
+        )
+
     @property
     def _in_trial_steps(self) -> str:
-        return f"in trial steps of up to {LARGEST_STEP * self._h:g} s"
+        return f"in trial steps of up to {STEPS * self._h:g} s"
 
     @property
     def _takes_any_step(self) -> bool:
@@ -407,16 +465,34 @@ class _Validation:
 
     def _moved(self) -> FloatArray:
         """The start values a little moved: at an equilibrium nothing moves."""
+        return self._starts + self._changes()
+
+    def _changes(self) -> FloatArray:
+        """By how much the inputs may be moved, shape (n,)."""
         nominal = [self._variables[name].nominal for name in self._inputs]
-        moved: FloatArray = self._starts + 0.01 * np.maximum(np.abs(self._starts), nominal)
-        return moved
+        changes: FloatArray = 0.01 * np.maximum(np.abs(self._starts[0]), nominal)
+        return changes
 
     def _end(self) -> Finding:
-        reply = self._trial.again(*self._begin, DoStep(0.0, self._h), Terminate(), Reset())
-        problem = _failure(reply)
-        if problem is None:
-            return Finding("terminate and reset", Grade.OK, "done")
-        return Finding("terminate and reset", Grade.NOTE, problem, "it is loaded anew instead")
+        """Behind a reset a model begins where it began before."""
+        what, instead = "terminate and reset", "it is loaded anew instead"
+        begin, step = self._begin, DoStep(0.0, self._h)
+        once = (*begin, GetOutputs(), step, Terminate())
+        reply = self._trial.again(*once)
+        if reply.error is not None:
+            return Finding(what, Grade.NOTE, f"{reply.error.phase}: {reply.error.cause}", instead)
+        again = self._trial.run(Reset(), *begin, GetOutputs())
+        if again.error is not None:
+            problem = f"its reset is broken: {again.error.phase}: {again.error.cause}"
+            return Finding(what, Grade.NOTE, problem, instead)
+        before, after = reply.results[len(begin)], again.results[-1]
+        assert isinstance(before, np.ndarray)
+        assert isinstance(after, np.ndarray)
+        clocks = [i for i, name in enumerate(self._outputs) if name in self._not_repeating]
+        if not np.array_equal(np.delete(before, clocks, 1), np.delete(after, clocks, 1)):
+            problem = "its reset is broken: its outputs at the start are others than before"
+            return Finding(what, Grade.NOTE, problem, instead)
+        return Finding(what, Grade.OK, "done")
 
     def _equal_steps(self, number: int) -> Iterator[Call]:
         time = 0.0
@@ -436,6 +512,20 @@ def _failure(reply: Reply) -> str | None:
         if isinstance(result, np.ndarray) and not np.isfinite(result).all():
             return "an output is not finite"
     return None
+
+
+def _clocks(reply: Reply) -> tuple[str, ...]:
+    """The outputs that do not repeat, as trial steps showed."""
+    examination = reply.results[-1] if reply.error is None else None
+    return examination.not_repeating if isinstance(examination, Examination) else ()
+
+
+def _reasons(poor: Mapping[str, str]) -> str:
+    """Why the derivatives of outputs are of no use."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in poor.items():
+        by_reason.setdefault(reason, []).append(name)
+    return "; ".join(f"those of {', '.join(names)} are {r}" for r, names in by_reason.items())
 
 
 def _is_not_completed(reply: Reply) -> bool:

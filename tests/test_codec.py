@@ -109,9 +109,7 @@ def arrays() -> st.SearchStrategy[np.ndarray]:
 
 
 calls = st.one_of(
-    st.sampled_from(
-        [Describe(), ExitInitializationMode(), GetDiscreteOutputs(), Terminate(), Reset()]
-    ),
+    st.sampled_from([Describe(), ExitInitializationMode(), GetDiscreteOutputs(), Terminate()]),
     st.builds(
         Initialize,
         any_float,
@@ -127,8 +125,24 @@ calls = st.one_of(
         st.dictionaries(texts, start_values, max_size=3),
         st.none() | any_float,
         numbers,
+        numbers,
+        st.lists(texts, max_size=3).map(tuple),
     ),
-    st.builds(Examine, any_float, any_float, any_float, any_float),
+    st.builds(Reset, st.booleans()),
+    st.builds(
+        Examine,
+        any_float,
+        any_float,
+        any_float,
+        any_float,
+        st.none() | any_float,
+        st.lists(any_float, max_size=3).map(tuple),
+        st.lists(any_float, max_size=3).map(tuple),
+        st.integers(0, 3),
+        st.booleans(),
+        st.lists(texts, max_size=3).map(tuple),
+        st.lists(texts, max_size=3).map(tuple),
+    ),
     st.builds(SetDiscreteInputs, st.lists(start_values, max_size=5).map(tuple)),
     st.builds(SetInputs, arrays()),
     st.builds(DoStep, any_float, any_float, st.booleans()),
@@ -182,10 +196,16 @@ examinations = st.builds(
     Examination,
     st.sampled_from(StateVerdict),
     texts,
+    st.booleans(),
     any_float,
     st.none() | any_float,
     any_float,
     st.none() | any_float,
+    st.none() | st.integers(0, 3),
+    texts,
+    st.lists(texts, max_size=3).map(tuple),
+    st.dictionaries(texts, texts, max_size=3),
+    texts,
 )
 
 ERRORS = [DoublestepError]
@@ -523,7 +543,7 @@ def program(shape: Any, numbers: bytes = b"") -> bytes:
         (program([[]]), "a call must be"),
         (program([[3]]), "a call must be"),
         (program([["explode"]]), "no call is named 'explode'"),
-        (program([["reset", 1]]), "takes 0 fields, not 1"),
+        (program([["terminate", 1]]), "takes 0 fields, not 1"),
         (program([["get_state"]]), "takes 1 fields, not 0"),
         (program([["get_state", -1]]), "integer from 0"),
         (program([["get_state", 2**63]]), "integer from 0"),

@@ -191,6 +191,32 @@ def test_an_early_return_is_an_event(capability_dir: Path, in_process: bool) -> 
     assert result["model.level"].max() == 2
 
 
+@pytest.mark.parametrize("estimator", ["mod", "rich"])
+def test_an_early_return_that_does_not_repeat_is_no_event(
+    capability_dir: Path, estimator: str
+) -> None:
+    """Saved states that lack the past of the event indicators: the first step after a restore
+    returns early, once. It is taken again, and the run is that of an FMU without this fault, step
+    by step: history, order and H are kept.
+    """
+    results = [
+        simulate(
+            System(
+                simulation={"stop_time": 1.0, "estimator": estimator},
+                slaves={"model": {"model": str(capability_dir / f"{fmu}.fmu")}},
+            ),
+            in_process=True,
+        )
+        for fmu in ("event_mode3", "loses_indicators3")
+    ]
+    right, faulty = results
+    assert right.summary["discontinuities"] == faulty.summary["discontinuities"] == 2
+    assert np.array_equal(right.time, faulty.time)
+    assert np.array_equal(right["model.y"], faulty["model.y"])
+    rejected = faulty.steps[~faulty.steps["accepted"]]
+    assert "model: early_return after a restore" in rejected["limiting_variable"].tolist()
+
+
 def mapped(folder: Path, source: str, target: str, mapping: dict[Any, Any], **more: Any) -> System:
     """The counter of one FMU drives another one through a mapping; four changes in a second."""
     model = {"model": str(folder / "all_types2.fmu")}

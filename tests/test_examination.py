@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from protocol.calls import Examine, ExitInitializationMode, GetOutputs, Initialize, Reset
 from protocol.errors import FatalSlaveError
 from protocol.slave import Causality, Examination, Slave, StateKind, StateVerdict
-from slave_node.examination import examine
 from slave_node.executor import Executor
 from slave_node.loading import load_slave
 from tests.trial_slaves import (
@@ -22,11 +21,13 @@ from tests.trial_slaves import (
     BrokenSlave,
     ClockedSlave,
     EulerSlave,
+    LosingSlave,
     NotRepeatingSlave,
     RestartingSlave,
     StaleSlave,
     TimedSlave,
     described,
+    examine,
 )
 
 H = 4e-3
@@ -47,6 +48,7 @@ def assert_left_as_it_was(slave: TimedSlave) -> None:
     [
         (TimedSlave, StateVerdict.EXACT, ""),
         (RestartingSlave, StateVerdict.RESTARTS_SOLVER, "repeat, but differ"),
+        (LosingSlave, StateVerdict.DOES_NOT_RESTORE, "times the tolerance"),
         (NotRepeatingSlave, StateVerdict.DOES_NOT_REPEAT, "the second time"),
         (BrokenSlave, StateVerdict.BROKEN, "fmi2SetFMUstate returned fmi2Error"),
         (StaleSlave, StateVerdict.EXACT, "right after a restore are not those that were saved"),

@@ -40,13 +40,13 @@ from protocol.errors import (
 )
 from protocol.slave import Causality, Slave, SlaveDescription, StateKind, StepStatus, VariableType
 from slave_node.deaths import OWN_FAILURE, death
-from slave_node.examination import examine
 from slave_node.states.channel import Channel, Message
 from slave_node.states.fork_habits import Event, Habits
 from slave_node.states.held_process import HeldProcess
 from slave_node.worker import ModelReference, WorkerProcess
 from tests.quarter_car_case import DISPLACEMENT
 from tests.state_programs import MODELS, begin, fragile, loaded, wander, wheel
+from tests.trial_slaves import examine
 from tests.waiting import BOUND, wait_until
 
 pytestmark = [
@@ -327,11 +327,15 @@ def no_step_is_dear(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_double_step_copies_each_process_once(
     fmu_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, estimator: str
 ) -> None:
-    """Three solutions need two copies; that of a state which is never restored is spared."""
+    """Three solutions need two copies; that of a state which is never restored is spared. Trial
+    steps before them would count too.
+    """
     copies = []
     copy = HeldProcess.copy
     monkeypatch.setattr(HeldProcess, "copy", lambda self: copies.append(self) or copy(self))
-    system = car(fmu_dir, "fork").with_simulation(initial_step_size=1e-3, largest_step_size=2e-3)
+    system = car(fmu_dir, "fork").with_simulation(
+        initial_step_size=1e-3, largest_step_size=2e-3, examine=False
+    )
     summary = simulate(
         system, output=tmp_path / "r", estimator=estimator, in_process=True, stop_time=0.4
     ).summary

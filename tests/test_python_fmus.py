@@ -21,9 +21,9 @@ from master_node import Result, load_system, simulate
 from protocol.calls import StepResult
 from protocol.errors import FatalSlaveError, ModelError
 from protocol.slave import Slave, StateVerdict, StepStatus
-from slave_node.examination import examine
 from slave_node.loading import describe_model, load_slave
 from tests.quarter_car_case import global_errors
+from tests.trial_slaves import examine
 from tests.waiting import BOUND
 
 pytest.importorskip("pythonfmu")

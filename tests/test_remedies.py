@@ -45,6 +45,7 @@ from tests.trial_slaves import (
     BrokenSlave,
     ClockedSlave,
     EulerSlave,
+    LosingSlave,
     NotRepeatingSlave,
     RestartingSlave,
     TimedSlave,
@@ -145,6 +146,7 @@ def test_exact_slaves_stay_where_they_are() -> None:
     [
         ({"native": NotRepeatingSlave, "fork": TimedSlave}, "fork", ["fork"]),
         ({"native": BrokenSlave, "fork": TimedSlave}, "fork", ["fork"]),
+        ({"native": LosingSlave, "fork": TimedSlave}, "fork", ["fork"]),
         ({"native": BrokenSlave, "replay": TimedSlave}, "replay", ["fork", "", "replay"]),
         (
             {"native": BrokenSlave, "fork": BrokenSlave, "replay": TimedSlave},
@@ -171,12 +173,11 @@ def test_states_that_cannot_be_trusted_are_saved_in_another_way(
     assert [c.state_kind for c in workshop.loaded[1:]] == loaded
     assert prepared.warnings[0].startswith("chassis: its saved states (")
     last = prepared.examinations["chassis"].state_verdict
+    assert prepared.outputs is not None
     if kind == "none":
-        assert prepared.outputs is None
-        assert last is StateVerdict.DOES_NOT_REPEAT
+        assert last is StateVerdict.NOT_TESTED  # it takes no trial steps any more
         assert prepared.warnings[-1].endswith("steps cannot be taken back")
     else:
-        assert prepared.outputs is not None  # from the round that found nothing wrong
         assert last is StateVerdict.EXACT
 
 
@@ -212,7 +213,7 @@ def test_a_solver_that_restarts_is_named_and_accepted() -> None:
     (warning,) = prepared.warnings
     assert warning.startswith("chassis: going back to a saved state restarts the model's solver")
     assert workshop.resets == 1
-    assert prepared.outputs is None
+    assert prepared.outputs is not None
     assert len(workshop.loaded) == 1
 
 
@@ -265,30 +266,42 @@ def test_one_euler_step_per_do_step_is_split_into_substeps() -> None:
     """As short as the trial steps showed, rounded down to two digits."""
     workshop = Workshop({"native": EulerSlave})
     prepared = workshop.prepare()
-    (configuration,) = workshop.loaded[1:]
-    largest = configuration.largest_substep
+    largest = workshop.loaded[-1].largest_substep
     assert largest is not None
     assert largest == float(f"{largest:.1e}")
-    (warning,) = prepared.warnings
+    held, warning = prepared.warnings
+    assert "its input derivatives are emulated" in held  # it takes the values only
     assert f"substeps of {largest!r} s at most" in warning
     assert prepared.examinations["chassis"].step_dependence < 1.0  # as it is now
 
 
 def test_input_derivatives_that_are_refused_are_emulated() -> None:
-    """A model may declare them, and take the first one only (FMI 2.0 cannot say that)."""
+    """A model may declare them, and take some orders only (FMI 2.0 cannot say that). Those that it
+    takes stay in use.
+    """
 
-    class FirstOrder(TimedSlave):
+    class SomeOrders(TimedSlave):
+        highest = 1
+
         def set_inputs(self, derivatives: np.ndarray) -> None:
-            if len(derivatives) > 2:
-                raise SlaveError("orders 1 to 1 are supported")
+            if len(derivatives) > self.highest + 1:
+                raise SlaveError(f"orders 1 to {self.highest} are supported")
             super().set_inputs(derivatives)
 
-    workshop = Workshop({"native": FirstOrder})
-    prepared = workshop.prepare()
-    assert prepared.descriptions["chassis"].input_derivatives is InputDerivatives.EMULATED
-    assert "its input derivatives are emulated, as it takes not all" in prepared.warnings[0]
-    assert prepared.outputs is not None
-    assert Workshop({"native": FirstOrder}, order=1).prepare().warnings == ()
+    class NoOrder(SomeOrders):
+        highest = 0
+
+    for faulty, highest, text in (
+        (SomeOrders, 1, "it makes use of input derivatives up to order 1 only"),
+        (NoOrder, 0, "its input derivatives are emulated, as it makes no use of any"),
+    ):
+        workshop = Workshop({"native": faulty})
+        prepared = workshop.prepare()
+        assert prepared.descriptions["chassis"].input_derivatives is InputDerivatives.EMULATED
+        assert text in prepared.warnings[0]
+        assert workshop.loaded[1:] == [Configure(max_input_order=highest)]
+        assert prepared.examinations["chassis"].state_verdict is StateVerdict.EXACT
+    assert Workshop({"native": SomeOrders}, order=1).prepare().warnings == ()
 
 
 @pytest.mark.parametrize("settings", [{"estimator": "none"}, {"examine": False}])
@@ -301,20 +314,50 @@ def test_no_trial_steps_where_nothing_hangs_on_them(settings: dict[str, Any]) ->
     assert len(workshop.loaded) == 1
 
 
-def test_a_slave_that_cannot_be_reset_ends_the_run_with_a_remedy() -> None:
+class Unresettable(RestartingSlave):
     """Some tools have no fmi2Reset."""
 
-    class Unresettable(RestartingSlave):
-        is_ready = False
+    is_ready = False
 
-        def reset(self) -> None:
-            if self.is_ready:
-                raise SlaveError("fmi2Reset is not supported")
-            super().reset()
-            self.is_ready = True
+    def reset(self) -> None:
+        """See `Slave`."""
+        if self.is_ready:
+            raise SlaveError("fmi2Reset is not supported")
+        super().reset()
+        self.is_ready = True
 
-    with pytest.raises(SlaveError, match=r"not supported; leave the trial steps out: .*examine"):
-        Workshop({"native": Unresettable}).prepare()
+
+class Unrefreshed(RestartingSlave):
+    """After a reset it begins elsewhere."""
+
+    initializations = 0
+
+    def exit_initialization_mode(self) -> None:
+        """See `Slave`."""
+        super().exit_initialization_mode()
+        self.x = self.x + 0.5 * self.initializations
+        self.initializations += 1
+
+
+@pytest.mark.parametrize(
+    ("faulty", "reason"),
+    [
+        (Unresettable, "fmi2Reset is not supported"),
+        (Unrefreshed, "its outputs at the start are others than before"),
+    ],
+)
+def test_a_slave_whose_reset_is_broken_is_loaded_anew(faulty: Make, reason: str) -> None:
+    """And that is said. Where it cannot be loaded, the run ends with a remedy."""
+    workshop = Workshop({"native": faulty})
+    prepared = workshop.prepare()
+    assert f"chassis: its reset is broken: {reason}; it is loaded anew" in prepared.warnings[-1]
+    assert len(workshop.loaded) == 2
+    assert prepared.outputs is not None
+    assert prepared.outputs.y[0].tolist() == [0.1, 0.0, 0.0, 0.1]
+    workshop = Workshop({"native": faulty})
+    workshop.executors["chassis"]._load = None
+    with pytest.raises(SlaveError, match=r"(not supported|loaded anew); leave the trial steps out"):
+        workshop.prepare()
 
 
 # ---- Runs ---------------------------------------------------------------------------------------

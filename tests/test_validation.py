@@ -85,7 +85,7 @@ class Truth:
 
     states: tuple[tuple[str, str], ...] = (("native", EXACT),)
     """Each way to save states down to the one that is used."""
-    inputs: str = "up to order 1, then: set_inputs: fmi2SetRealInputDerivatives returned"
+    inputs: str = "up to order 1, then: set_inputs: fmi2SetRealInputDerivatives of order 2 returned"
     outputs: str = "agree with differences"
     steps: str = "taken"
     sizes: str = "taken"
@@ -93,6 +93,10 @@ class Truth:
     clock: str = ""
     halves: str = "agree"
     remark: str = ""
+    clocks: str = ""
+    slopes: str = ""
+    """What going back tells of output derivatives."""
+    reset: str = "done"
 
 
 LAG = Truth()
@@ -100,6 +104,15 @@ HELD = Truth(inputs="not taken by the model", outputs="none")
 WHOLE = Truth(inputs="up to order 3")
 UNREACHED = "does not reach the FMU"
 AT_REST = f"{EXACT}; no output moved in the trial steps"
+CLOCKS = replace(
+    LAG,
+    outputs="get_outputs: fmi2GetRealOutputDerivatives of order 1 returned fmi2Error",
+    clocks="cpu_time, steps, number",
+)
+SECOND_ORDER = replace(
+    LAG,
+    inputs="up to order 2, then: set_inputs: fmi2SetRealInputDerivatives of order 3 returned",
+)
 OF_ONE_SIZE = {"sizes": "not declared", "halves": ""}
 UNUSABLE = {"licence_error": "licence not found", "missing_library": "libdoublestep_absent.so"}
 
@@ -144,7 +157,7 @@ CAPABILITIES = {
     "discards": replace(LAG, steps="do_step: discard at t=0.002 s; steps of 0.001 s are taken"),
     "large_state": LAG,
     "internal_clock": replace(HELD, clock="outputs move only at multiples of 0.01 s", halves=""),
-    "euler_per_step": replace(HELD, halves="differ by 2 times the tolerance"),
+    "euler_per_step": replace(HELD, halves="differ by "),
     "crashes": replace(
         LAG,
         states=(
@@ -161,6 +174,33 @@ CAPABILITIES = {
     "not_finite": LAG,
     "changes_process": LAG,
     "plain_lag": LAG,
+    "slopes_nan_at_first": LAG,
+    "slopes_nan": replace(LAG, outputs="those of y are not finite"),
+    "slopes_infinite": replace(LAG, outputs="those of c are not finite"),
+    "slopes_thousandfold": replace(LAG, outputs="those of y are nowhere near the change"),
+    "slopes_differences": replace(LAG, outputs="those of y are differences over the last step"),
+    "slopes_noise": replace(LAG, slopes="those of y, c are others when the same step is taken"),
+    "second_order": SECOND_ORDER,
+    "ignores_second_order": replace(
+        LAG, inputs="up to order 1, then: those of order 2 change nothing"
+    ),
+    "ignores_derivatives": replace(
+        LAG, inputs="up to order 0, then: those of order 1 change nothing"
+    ),
+    "counts_inputs": SECOND_ORDER,
+    "clocks": CLOCKS,
+    "clocks_no_state": replace(CLOCKS, states=FORKED),
+    "loses_state": replace(
+        HELD,
+        states=(("native", "does not restore: "), *FORKED),
+        halves="differ by ",
+    ),
+    "saturated_controller": replace(
+        HELD, states=(("native", AT_REST),), halves="differ by "
+    ),
+    "reset_keeps_fmi1": replace(HELD, states=FORKED, reset="its reset is broken: "),
+    "reset_keeps_state": replace(HELD, states=FORKED, reset="its reset is broken: "),
+    "reset_spoils_fmi1": replace(HELD, states=FORKED, reset="its reset is broken: "),
     "execution_tool": replace(LAG, remark="it needs the tool that exported it"),
     "fixed_step": replace(HELD, **OF_ONE_SIZE),
     "fixed_step_fmi3": replace(HELD, **OF_ONE_SIZE, zero=UNREACHED),
@@ -168,6 +208,7 @@ CAPABILITIES = {
     "terminates3": replace(HELD, outputs=LAG.outputs, zero=UNREACHED),
     "event_mode3": replace(HELD, inputs="no continuous inputs", zero=UNREACHED),
     "rounds_events3": replace(HELD, inputs="no continuous inputs", zero=UNREACHED),
+    "loses_indicators3": replace(HELD, inputs="no continuous inputs", zero=UNREACHED),
     "few_variables": LAG,
     "many_variables": LAG,
     "units_metres": LAG,
@@ -243,7 +284,9 @@ def test_every_report_is_true(request: pytest.FixtureRequest, folder: str, fmu: 
         check(f"saved states, {way}", result)
     check("internal clock", truth.clock)
     check("one step against two", truth.halves)
-    check("terminate and reset", "done")
+    check(f"outputs that do not repeat, {truth.states[-1][0]}", truth.clocks)
+    check("output derivatives, going back", truth.slopes)
+    check("terminate and reset", truth.reset)
     assert not found
     for finding in findings:
         assert finding.grade is not Grade.PROBLEM

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from protocol.calls import StepResult
+from protocol.calls import Examine, StepResult
 from protocol.errors import SlaveError, StepRejectedError
-from protocol.slave import Slave, StepStatus
+from protocol.slave import Examination, Slave, StepStatus
+from slave_node import examination
 from tests.quarter_car_case import CHASSIS, LinearSlave, LinearSystem
 
 
@@ -101,6 +102,27 @@ class RestartingSlave(TimedSlave):
         self.past = 0
 
 
+class LosingSlave(TimedSlave):
+    """A part of its state is lost in a restore: its steps repeat, and lead elsewhere."""
+
+    def reset(self) -> None:
+        """See `Slave`."""
+        super().reset()
+        self.lost = 0.0
+
+    def advance(self, time: float, step_size: float, no_set_state_prior: bool) -> StepResult:
+        """See `TimedSlave`."""
+        result = super().advance(time, step_size, no_set_state_prior)
+        self.x = self.x + self.lost
+        self.lost += 1.0
+        return result
+
+    def set_state(self, state: object) -> None:
+        """See `Slave`."""
+        super().set_state(state)
+        self.lost = 0.0
+
+
 class NotRepeatingSlave(TimedSlave):
     """A part of its state is not saved."""
 
@@ -160,6 +182,13 @@ class BoundedSlave(TimedSlave):
         if step_size > self.largest:
             raise StepRejectedError("too long")
         return super().advance(time, step_size, no_set_state_prior)
+
+
+def examine(
+    slave: Slave, time: float, step_size: float, *tolerances: float, **more: Any
+) -> Examination:
+    """The examination with inputs as they are; tolerances are the relative and the absolute one."""
+    return examination.examine(slave, Examine(time, step_size, *tolerances, **more))
 
 
 def described(slave: Slave, **fields: Any) -> Slave:

@@ -331,6 +331,91 @@ def lags() -> Iterator[Fmu]:
     )
     yield from _fixed_steps()
     yield from _ends()
+    yield from _derivatives()
+    yield from _states()
+
+
+SLOPES = {
+    "slopes_nan_at_first": ("NAN_AT_FIRST", "is NaN before the first step"),
+    "slopes_nan": ("NAN_ALWAYS", "is NaN at any time"),
+    "slopes_infinite": ("INFINITE_CONSTANT", "is right, and that of its constant is infinite"),
+    "slopes_thousandfold": ("THOUSANDFOLD", "is a thousand times too large"),
+    "slopes_differences": ("DIFFERENCE", "is the difference over the last step"),
+    "slopes_noise": ("WITH_NOISE", "is another one each time it is read"),
+}
+
+
+def _derivatives() -> Iterator[Fmu]:
+    constant = Variable("c", LAG_REFERENCES, "output", depends=(), description="A constant, 3")
+    for name, (macro, what) in SLOPES.items():
+        yield make_fmu(
+            replace(
+                lag_description(name, f"A lag whose output derivative {what}"),
+                variables=(*lag_variables(), constant),
+            ),
+            (*LAG, SOURCES / "slopes.c"),
+            capabilities=LAG_CAPABILITIES,
+            definitions={"SLOPE": macro},
+        )
+    for name, description, orders, used, most in (
+        ("second_order", "A lag that takes input derivatives up to order 2", 2, 2, ""),
+        ("ignores_second_order", "A lag that makes use of those of order 1 only", 3, 1, ""),
+        ("ignores_derivatives", "A lag that makes no use of input derivatives", 3, 0, ""),
+        ("counts_inputs", "A lag that takes one input derivative in a call", 2, 2, "1"),
+    ):
+        yield make_fmu(
+            lag_description(name, description),
+            (*LAG, SOURCES / "some_orders.c"),
+            capabilities=Capabilities(input_derivatives=orders, output_derivatives=1),
+            definitions={"USED_ORDER": str(used)} | ({"MOST_DERIVATIVES": most} if most else {}),
+        )
+
+
+def _states() -> Iterator[Fmu]:
+    clocks = (
+        Variable("cpu_time", LAG_REFERENCES, "output", unit="s", depends=()),
+        Variable("steps", LAG_REFERENCES + 1, "output", depends=()),
+        Variable("number", LAG_REFERENCES + 2, "output", "Int32", depends=()),
+    )
+    for name, saved_states in (("clocks", True), ("clocks_no_state", False)):
+        yield make_fmu(
+            replace(
+                lag_description(name, "A lag with outputs that are clocks and counters"),
+                variables=(*lag_variables(), *clocks),
+            ),
+            (*LAG, SOURCES / "clocks.c"),
+            capabilities=replace(LAG_CAPABILITIES, saved_states=saved_states),
+        )
+    yield make_fmu(
+        lag_description("loses_state", "A lag behind another one that is not saved"),
+        (*LAG, SOURCES / "loses_state.c"),
+        capabilities=Capabilities(),
+    )
+    yield make_fmu(
+        replace(
+            lag_description("saturated_controller", "A controller of single Euler steps"),
+            variables=(
+                Variable("u", 0, "input", start="0"),
+                Variable("y", 1, "output", depends=()),
+                Variable("T", 2, "parameter", start="0.002", unit="s"),
+                Variable("gain", LAG_REFERENCES, "parameter", start="10"),
+            ),
+        ),
+        (*LAG, SOURCES / "saturated_controller.c"),
+        capabilities=Capabilities(),
+    )
+    for name, version, macro, what in (
+        ("reset_keeps_fmi1", 1, "RESET_KEEPS_STATE", "is as it was before"),
+        ("reset_keeps_state", 2, "RESET_KEEPS_STATE", "is as it was before"),
+        ("reset_spoils_fmi1", 1, "RESET_SPOILS", "is of no use"),
+    ):
+        yield make_fmu(
+            lag_description(name, f"A lag that {what} after a reset"),
+            (*LAG, SOURCES / "plain_lag.c"),
+            version=version,
+            capabilities=Capabilities(saved_states=False),
+            definitions={"RESET": macro},
+        )
 
 
 def _fixed_steps() -> Iterator[Fmu]:
@@ -364,7 +449,11 @@ def _ends() -> Iterator[Fmu]:
         version=3,
         capabilities=Capabilities(output_derivatives=1),
     )
-    stairs = (("event_mode3", None), ("rounds_events3", {"ROUNDS_EVENTS": "1"}))
+    stairs = (
+        ("event_mode3", None),
+        ("rounds_events3", {"ROUNDS_EVENTS": "1"}),
+        ("loses_indicators3", {"LOSES_INDICATORS": "1"}),
+    )
     for name, definitions in stairs:
         yield make_fmu(
             Description(

@@ -27,7 +27,8 @@ class OutputHistory:
 
     Attributes:
         times: newest first [s].
-        outputs: at each of them, shape (rows, m): values, and derivatives if there are two rows.
+        outputs: at each of them, shape (rows, m): values, and derivatives if there are two rows,
+            not finite where one is not known.
     """
 
     times: tuple[float, ...]
@@ -45,12 +46,16 @@ class OutputHistory:
         Args:
             times: between the newest points [s], shape (s,).
             order: k of the step.
-            has_derivative: which outputs come with their derivatives, shape (m,).
+            has_derivative: which outputs come with their derivatives, shape (m,); one that lacks
+                its derivative at a newest point is read as those without.
         """
         now = self.times[0]
         offsets = [time - now for time in self.times]
         tau = (times - now)[:, np.newaxis]
         values = np.empty((len(times), has_derivative.size))
+        if has_derivative.any():
+            slopes_known = [np.isfinite(y[1]) for y in self.outputs[:_HERMITE_POINTS]]
+            has_derivative = has_derivative & np.logical_and.reduce(slopes_known)
         plain = ~has_derivative
         if plain.any():
             nodes = offsets[: max(_HERMITE_POINTS, order + 2)]

@@ -76,8 +76,8 @@ class CouplingHistory(NamedTuple):
 
     Attributes:
         times: T_n, T_(n-1), ..., newest first [s].
-        inputs: at each of them, shape (rows, n); row 0 is u, row 1, if there is one, u' (0 for
-            inputs whose derivative is not known).
+        inputs: at each of them, shape (rows, n); row 0 is u, row 1, if there is one, u': 0 for
+            inputs that never have one, not finite where an input that has one lacks it.
         depth: how many points are kept at most.
     """
 
@@ -117,6 +117,19 @@ class CouplingHistory(NamedTuple):
     def before(self, number: int) -> CouplingHistory:
         """Without the ``number`` newest points, of which there must be fewer than of all."""
         return CouplingHistory(self.times[number:], self.inputs[number:], self.depth)
+
+    def without_slopes(self) -> CouplingHistory:
+        """With no derivative at the newest point."""
+        newest = self.inputs[0].copy()
+        newest[1:] = np.nan
+        return CouplingHistory(self.times, (newest, *self.inputs[1:]), self.depth)
+
+    def slopes(self, columns: NDArray[np.intp], most: int) -> int:
+        """At how many of the newest points, ``most`` at most, these inputs have derivatives."""
+        for number, rows in enumerate(self.inputs[:most]):
+            if not np.isfinite(rows[1].take(columns)).all():
+                return number
+        return min(most, len(self.inputs))
 
     def every_second(self) -> CouplingHistory:
         """T_n, T_(n-2), T_(n-4), ...: the grid of one step of 2H."""
@@ -172,6 +185,31 @@ class Extrapolation:
             for kind in self.kinds
         )
 
+    def known(
+        self, polynomials: Polynomials, history: CouplingHistory, points: int | None = None
+    ) -> Polynomials:
+        """The polynomials as far as ``history`` has the derivatives that they meet.
+
+        A derivative that is not finite is none at its point: inputs of that kind meet its value
+        alone, and more points where there are any.
+
+        Args:
+            polynomials: of each kind, see `polynomials`.
+            history: with all points that they can go through.
+            points: through how many of them they may go; None: all.
+        """
+        if not any(polynomial.derivative_points for polynomial in polynomials):
+            return polynomials
+        points = len(history.times) if points is None else points
+        return tuple(
+            [
+                polynomial.limited(polynomial.order, history.slopes(columns, slopes), points)
+                if (slopes := polynomial.derivative_points)
+                else polynomial
+                for columns, polynomial in zip(self._columns, polynomials, strict=True)
+            ]
+        )
+
     def nodes(
         self, times: Sequence[float], polynomials: Polynomials, origin: float, known_ahead: int = 0
     ) -> list[Nodes]:
@@ -201,9 +239,10 @@ class Extrapolation:
         Args:
             history: to go through. Its first ``known_ahead`` points are of use for the inputs
                 ``ahead`` only; the others may have anything there.
-            polynomials: of each kind.
+            polynomials: of each kind; where it lacks a derivative that they meet, see `known`.
             known_ahead: 0 or 1.
         """
+        polynomials = self.known(polynomials, history.before(known_ahead))
         begins = self._begins[known_ahead]
         if len(polynomials) == 1:
             return InputSignal(_rows(history, begins[0], polynomials[0], known_ahead))

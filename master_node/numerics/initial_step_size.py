@@ -25,12 +25,13 @@ def trial_step_size(
 
     Args:
         y: outputs at T_0, shape (m,).
-        slope: their derivatives as far as they are known, else 0, shape (m,); None: not at all.
+        slope: their derivatives as far as they are known, else 0 or not finite, shape (m,); None:
+            not at all.
         scale: ATOL + RTOL |y|, shape (m,).
         duration: simulated time [s].
     """
     d0 = _norm(y, scale)
-    d1 = 0.0 if slope is None else _norm(slope, scale)
+    d1 = 0.0 if slope is None else _norm(np.where(np.isfinite(slope), slope, 0.0), scale)
     if d0 < _SMALL or d1 < _SMALL:
         return _WITHOUT_KNOWLEDGE * duration
     return min(0.01 * d0 / d1, 1e-3 * duration)
@@ -45,10 +46,12 @@ def untried_step_size(
 
     Args:
         y: outputs at T_0, shape (m,).
-        slope: their derivatives, shape (m,); None: one of them is not known.
+        slope: their derivatives, shape (m,), not finite where one is not known; None: none is.
         scale: ATOL + RTOL |y|, shape (m,).
         duration: simulated time [s].
     """
+    if slope is not None and not np.isfinite(slope).all():
+        slope = None
     trial = trial_step_size(y, slope, scale, duration)
     d1 = 0.0 if slope is None else _norm(slope, scale)
     return min(trial, 0.5 / d1) if d1 > 0.0 else trial

@@ -143,7 +143,8 @@ def input_magnitudes(
 
     Args:
         history: newest points; as many levels as there are conditions, `DEPTH` at most.
-        has_derivative: which inputs have one in the history, shape (n,).
+        has_derivative: which inputs have one in the history, shape (n,); not those that lack it
+            at one of the two newest points.
         scale: tolerances of the inputs, shape (n,), unit [u].
         group_of_input: index of the group that an input acts on, shape (n,).
         groups: how many groups there are.
@@ -153,6 +154,9 @@ def input_magnitudes(
     """
     points = min(len(history.times), DEPTH)
     table = _differences(history, [(i, False) for i in range(points)])
+    if has_derivative.any():
+        known = [np.isfinite(rows[1]) for rows in history.inputs[: min(points, 2)]]
+        has_derivative = has_derivative & np.logical_and.reduce(known)
     if has_derivative.any():
         doubled = [(i, again) for i in range(points) for again in (False, True)[: 1 + (i < 2)]]
         hermite = _differences(history, doubled[:DEPTH])

@@ -28,6 +28,10 @@ class Recording:
         self._discrete: list[tuple[DiscreteValue, ...]] = []
         self._steps = Steps()
 
+    def set_settings(self, settings: Mapping[str, object]) -> None:
+        """What the run goes on with, after its slaves were examined."""
+        self._settings = plain_mapping(settings)
+
     def started(self, start: RunStart) -> None:
         """Forget an earlier run and note the row of T_0."""
         self._start, self._end = start, None

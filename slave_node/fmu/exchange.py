@@ -40,7 +40,8 @@ class Buffer:
         rows: row j holds the j-th derivatives, shape (MAX_ORDER + 1, n).
         first: ``first[r]`` is a view of the first r rows.
         transfer_values: transfers row 0; returns the FMU's status.
-        transfer_derivatives: ``transfer_derivatives[k]()`` transfers rows 1 to k, k >= 1.
+        transfer_derivatives: ``transfer_derivatives[k]()`` transfers row k, k >= 1. One call for
+            each order: tools check the number of value references against that of the inputs.
         values_function, derivatives_function: what these call.
     """
 
@@ -86,18 +87,18 @@ class ExchangeBuffer(Buffer):
     ) -> None:
         n = len(references)
         super().__init__(n)
-        self._references = np.tile(references, MAX_ORDER)
-        self._orders = np.repeat(np.arange(1, MAX_ORDER + 1, dtype=np.int32), n)
-        of, address = self._references.ctypes.data, self.rows.ctypes.data
+        self._references = references
+        self._orders = _order_numbers(n)
+        of = references.ctypes.data
+        rows, orders = _row_addresses(self.rows), _row_addresses(self._orders)
         self.values_function = values
-        self.transfer_values = bind(values, VALUES_CALL, of, n, address)
+        self.transfer_values = bind(values, VALUES_CALL, of, n, rows[0])
         if not derivatives:
             return
         self.derivatives_function = derivatives
-        order_numbers, row_1 = self._orders.ctypes.data, address + n * self.rows.itemsize
         self.transfer_derivatives = [
-            bind(derivatives, DERIVATIVES_CALL, of, k * n, order_numbers, row_1)
-            for k in range(MAX_ORDER + 1)
+            bind(derivatives, DERIVATIVES_CALL, of, n, order, row)
+            for order, row in zip(orders, rows, strict=True)
         ]
 
 
@@ -232,32 +233,42 @@ class ArrayExchangeBuffer(Buffer):
         return worst
 
     def _derivatives(self, places: Sequence[Place], bind: Bind) -> Sequence[Callable[[], int]]:
-        """All orders in one call; the values are of type Float64 whatever the variables are."""
+        """The values are of type Float64 whatever the variables are."""
         whole = _WholeVariables(np.float64, places, range(len(places)))
         n, size = len(whole.references), len(whole.values)
-        references = np.tile(whole.references, MAX_ORDER)
-        orders = np.repeat(np.arange(1, MAX_ORDER + 1, dtype=np.int32), n)
-        values = np.zeros((MAX_ORDER, size))
-        self._kept += [references, orders, values]
+        orders = _order_numbers(n)
+        self._kept += [whole.references, orders, whole.values]
         calls = [
             bind(
                 self.derivatives_function,
                 DERIVATIVES_CALL_3,
-                references.ctypes.data,
-                k * n,
-                orders.ctypes.data,
-                values.ctypes.data,
-                k * size,
+                whole.references.ctypes.data,
+                n,
+                order,
+                whole.values.ctypes.data,
+                size,
             )
-            for k in range(MAX_ORDER + 1)
+            for order in _row_addresses(orders)
         ]
 
         def transfer(k: int) -> int:
             status: int = calls[k]()
-            self.rows[1 : k + 1] = values[:k, whole.elements]
+            self.rows[k] = whole.values[whole.elements]
             return status
 
         return [partial(transfer, k) for k in range(MAX_ORDER + 1)]
+
+
+def _order_numbers(n: int) -> NDArray[np.int32]:
+    """The order of each of n derivatives, shape (MAX_ORDER + 1, n): row k is k."""
+    orders = np.empty((MAX_ORDER + 1, n), dtype=np.int32)
+    orders[...] = np.arange(MAX_ORDER + 1)[:, np.newaxis]
+    return orders
+
+
+def _row_addresses(rows: NDArray[Any]) -> list[int]:
+    """Where each row begins."""
+    return [rows.ctypes.data + i * rows.strides[0] for i in range(len(rows))]
 
 
 def _nothing() -> int:

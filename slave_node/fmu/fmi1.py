@@ -33,6 +33,7 @@ from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, refere
 from slave_node.fmu.log import LOGGER_1, add_proxy, instantiating, register, unregister
 from slave_node.fmu.values import ValueType
 
+_TEXTS = ("fmi1GetVersion", "fmi1GetTypesPlatform")
 _LAST_SUCCESSFUL_TIME = 2
 _NEW_STEP = 1
 
@@ -52,6 +53,14 @@ class Fmi1Instance(FmuInstance):
     @property
     def _fmpy_class(self) -> Callable[..., Any]:
         return FMU1Slave  # type: ignore[no-any-return]
+
+    def _load(self, name: str) -> Any:
+        """As everywhere; FMPy takes the statuses of most functions for texts, and reads them."""
+        fmu = super()._load(name)
+        for known, function in fmu._functions.items():
+            if function.restype is ctypes.c_char_p and known not in _TEXTS:
+                function.restype = ctypes.c_int
+        return fmu
 
     def _instantiate(self, *, log_all: bool) -> None:
         callbacks = fmi1CallbackFunctions()

@@ -51,18 +51,16 @@ class FmuSlave(Slave):
             )
         if columns == 0:
             return
-        if rows < self._rows_set:
-            inputs.rows[rows:] = 0.0
-        else:
-            self._rows_set = rows
+        inputs.rows[rows:] = 0.0
         inputs.first[rows][...] = derivatives
         status = inputs.transfer_values()
         if status:
             self._instance.check(inputs.values_function, status)
-        if self._rows_set > 1:
-            status = inputs.transfer_derivatives[self._rows_set - 1]()
+        for order in range(1, max(rows, self._rows_set)):
+            status = inputs.transfer_derivatives[order]()
             if status:
-                self._instance.check(inputs.derivatives_function, status)
+                self._instance.check(f"{inputs.derivatives_function} of order {order}", status)
+            self._rows_set = max(order + 1, self._rows_set)
         restore_floating_point()
 
     def get_outputs(self, order: int) -> FloatArray:
@@ -77,11 +75,11 @@ class FmuSlave(Slave):
             status = outputs.transfer_values()
             if status:
                 self._instance.check(outputs.values_function, status)
-            if order:
-                status = outputs.transfer_derivatives[order]()
+            for k in range(1, order + 1):
+                status = outputs.transfer_derivatives[k]()
                 if status:
                     self._instance.check(
-                        outputs.derivatives_function,
+                        f"{outputs.derivatives_function} of order {k}",
                         status,
                         remedy="leave output derivatives out: derivative_points = 0",
                     )

@@ -17,6 +17,7 @@ from protocol.python_processes import python_command
 from protocol.threads import LIMITS
 from slave_node.states.channel import PROCESS, Channel
 from slave_node.states.fork_keeper import OBITUARY
+from slave_node.states.repeating import RepeatingPart
 
 _IDLE_TIME = 1.0
 _OBITUARY_TIME = 1.0
@@ -32,15 +33,20 @@ _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THR
 class HolderFamily:
     """The keeper and the holders below it; see ``fork_keeper.py``.
 
+    Args:
+        repeating: tells what of their answers is to repeat.
+
     Attributes:
         first: our end of the socket to the first holder, which holds no model yet.
         first_process: its process id.
+        repeating: see above.
 
     Raises:
         HostLimitError, SlaveKilledError: they do not come up.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, repeating: RepeatingPart) -> None:
+        self.repeating = repeating
         ours, theirs = socket.socketpair()
         self._deaths: dict[int, int] = {}
         self._obituaries, obituaries = os.pipe()

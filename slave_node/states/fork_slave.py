@@ -49,6 +49,7 @@ from slave_node.states.fork_family import HolderFamily
 from slave_node.states.fork_habits import Event, Habits, Situation
 from slave_node.states.fork_trail import START, Task, Trail
 from slave_node.states.held_process import HeldProcess, refusal
+from slave_node.states.repeating import RepeatingPart
 from slave_node.states.step_message import decode_stepped, encode_step
 
 _CLOSE_TIME = 0.5
@@ -110,7 +111,7 @@ class ForkSlave(Slave):
 
     def _load(self) -> None:
         """Start with a new family; there is none."""
-        self._family = HolderFamily()
+        self._family = HolderFamily(RepeatingPart(self._model.configuration.not_repeating))
         self._active: HeldProcess | None = HeldProcess(
             self._family, self._family.first, self._family.first_process
         )
@@ -211,7 +212,8 @@ class ForkSlave(Slave):
             (duration,) = DURATION.unpack_from(answer)
             answer = answer[DURATION.size :]
             if trail is not None:
-                self._trail = trail.after(Task(kind, payload, answer), duration)
+                part = self._family.repeating.of(kind, payload, answer)
+                self._trail = trail.after(Task(kind, payload, part), duration)
         return answer_kind, answer
 
     def _drop_active(self) -> None:
@@ -270,6 +272,7 @@ class ForkSlave(Slave):
         early_return: bool = False,
     ) -> None:
         """See `Slave`."""
+        self._family.repeating.bind(outputs, discrete_outputs)
         self._run(
             Initialize(
                 start_time,

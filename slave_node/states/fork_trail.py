@@ -16,7 +16,7 @@ _LARGEST = 2**15  # less than what sockets hold: it is sent, and answered, witho
 
 
 class Task(NamedTuple):
-    """A message to a process that holds a model, and its answer without the duration."""
+    """A message to a process that holds a model, and of its answer what is to repeat."""
 
     kind: Message
     payload: bytes

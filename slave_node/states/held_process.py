@@ -102,7 +102,10 @@ class HeldProcess:
             while self._owed:
                 task = self._owed.popleft()
                 kind, answer = self._channel.receive()
-                if kind is not Message.DONE or answer[DURATION.size :] != task.answer:
+                part = self._family.repeating.of
+                if kind is not Message.DONE or task.answer != part(
+                    task.kind, task.payload, answer[DURATION.size :]
+                ):
                     raise _did_not_repeat(task)
         except (EOFError, OSError):
             raise self._never_met() from None

@@ -6,6 +6,7 @@ at. So the holder does as little here as it can; all other calls travel as progr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from struct import Struct
 
 import numpy as np
@@ -63,6 +64,20 @@ def execute_step(slave: Slave, message: bytes) -> bytes:
             time=time,
             step_size=step_size,
         ) from exception
+
+
+def with_outputs(answer: bytes, number: int, change: Callable[[FloatArray], FloatArray]) -> bytes:
+    """The answer of `execute_step` with other outputs.
+
+    Args:
+        answer: see `decode_stepped`.
+        number: of the outputs, n.
+        change: gives them, from those that there are, shape (rows, n).
+    """
+    outputs = np.frombuffer(answer, np.float64, offset=_RESULT.size)
+    if not outputs.size:
+        return answer
+    return answer[: _RESULT.size] + change(outputs.reshape(-1, number)).tobytes()
 
 
 def decode_stepped(answer: bytes, order: int | None) -> tuple[StepResult, FloatArray | None]:

@@ -127,7 +127,7 @@ fmi1Status fmi1(ResetSlave)(fmi1Component c)
     Instance *instance = enter(c, __func__, STEP | STEP_DISCARDED | TERMINATED | FAILED);
     if (!instance)
         return fmi1Error;
-    instance_reset(instance);
+    reset_by_importer(instance);
     return fmi1OK;
 }
 

@@ -123,7 +123,7 @@ fmi2Status fmi2Reset(fmi2Component c)
     Instance *instance = enter(c, __func__, ANY_MODE);
     if (!instance)
         return fmi2Error;
-    instance_reset(instance);
+    reset_by_importer(instance);
     return fmi2OK;
 }
 

@@ -116,7 +116,7 @@ fmi3Status fmi3Reset(fmi3Instance c)
     Instance *instance = enter(c, __func__, ANY_MODE & ~INTERMEDIATE_UPDATE);
     if (!instance)
         return fmi3Error;
-    instance_reset(instance);
+    reset_by_importer(instance);
     return fmi3OK;
 }
 

@@ -141,6 +141,31 @@ void instance_reset(Instance *instance)
     behaviour.start(instance->state);
 }
 
+/* How a reset goes wrong. */
+enum { RESETS, RESET_KEEPS_STATE, RESET_SPOILS };
+
+#ifndef RESET
+#define RESET RESETS
+#endif
+
+void reset_by_importer(Instance *instance)
+{
+    if (RESET != RESET_KEEPS_STATE) {
+        instance_reset(instance);
+        if (RESET == RESET_SPOILS)
+            instance->standing.mode = FAILED;
+        return;
+    }
+    instance->standing = (Standing){
+        .stop_time = INFINITY, .tolerance = DEFAULT_TOLERANCE, .mode = INSTANTIATED};
+}
+
+/* The most value references that one call of input derivatives may have; some tools count them
+ * against the number of inputs, whatever the orders. */
+#ifndef MOST_DERIVATIVES
+#define MOST_DERIVATIVES SIZE_MAX
+#endif
+
 Status set_experiment(Instance *instance, const char *function, bool tolerance_defined,
                       double tolerance, double start, bool stop_defined, double stop)
 {
@@ -373,6 +398,9 @@ Status set_input_derivatives(Instance *instance, const char *function, const uin
         return ERROR;
     if (MAX_INPUT_DERIVATIVE_ORDER == 0 || !behaviour.input_derivative)
         return report(instance, ERROR, function, "derivatives of inputs are not supported");
+    if (n > MOST_DERIVATIVES)
+        return report(instance, ERROR, function, "invalid nvr = %zu (number of inputs = %zu)", n,
+                      (size_t)MOST_DERIVATIVES);
     size_t run;
     for (size_t i = 0; i < n; i += run) {
         if (!order || order[i] < 1 || order[i] > MAX_INPUT_DERIVATIVE_ORDER)

@@ -52,6 +52,9 @@ bool instance_open(Instance *instance, const char *function, const char *guid,
 void instance_free(Instance *instance);
 void instance_reset(Instance *instance);
 
+/* What the importer asks for: the same, or less, as RESET says. */
+void reset_by_importer(Instance *instance);
+
 /* The instance behind `component` if `function` is allowed in its mode, else NULL and a message. */
 Instance *enter(void *component, const char *function, unsigned allowed);
 

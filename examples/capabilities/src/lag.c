@@ -32,7 +32,8 @@ void lag_initialized(void *state, double time)
 {
     Lag *lag = state;
     (void)time;
-    lag->x = lag->x_start;
+    if (lag->initialized == 0.0) /* else a reset has kept x */
+        lag->x = lag->x_start;
     lag->initialized = 1.0;
 }
 

@@ -1,0 +1,1 @@
+"""Trial steps of a slave: what each kind of them shows."""
