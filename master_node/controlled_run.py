@@ -5,6 +5,7 @@ What is tried next is a value (`Position`), so a rejected step is one that is no
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -45,6 +46,8 @@ from master_node.step_size_rules import crossings, step_size_limits
 from protocol.errors import DeadlineError, DoublestepError, SlaveError, StepSizeError
 from protocol.slave import StepStatus
 
+log = logging.getLogger("master_node")
+
 _INF = float("inf")
 _TRIALS = 5
 
@@ -64,6 +67,8 @@ class Position(NamedTuple):
         event: where a slave has returned early, and a double step must end [s]; None: nowhere.
         unchanged: up to where discrete outputs are known not to change, and a double step must end
             [s]; None: nowhere.
+        crossings: how many more double steps behind an event are kept whatever ERR is, as H is on a
+            grid and cannot be made smaller.
     """
 
     history: CouplingHistory
@@ -76,6 +81,7 @@ class Position(NamedTuple):
     errors_in_a_row: int = 0
     event: float | None = None
     unchanged: float | None = None
+    crossings: int = 0
 
     @property
     def time(self) -> float:
@@ -118,6 +124,7 @@ class ControlledRun:
         self._available = self._make_available(context, estimator)
         self._defects = InputDefects(coupled, scheme)
         self._missing = MissingDerivatives(coupled, scheme)
+        self._loses_events: set[str] = set()
         present, past = EXPONENTS[settings.controller]
         self._controller = StepSizeController(
             settings.alpha,
@@ -307,6 +314,8 @@ class ControlledRun:
             return following
         if error.norm <= 1.0 and not jumps:
             return self._accept(position, step, error, defects)
+        if position.crossings and error.norm < _INF and self._is_smallest(times, target):
+            return self._accept_behind_event(position, step, error, defects)
         return self._reject(position, step, error, defects, target)
 
     def _attempt(
@@ -315,21 +324,39 @@ class ControlledRun:
         """One attempt, once more where it says nothing of what comes.
 
         Without derivatives, where one turns out to be missing at T_n + H: both small steps must
-        have polynomials of the same kind. As it was, where a slave returns early in its first step
+        have polynomials of the same kind. Carefully, where a slave returns early in its first step
         from a restored state: some do so once because their states lack the past of their event
         indicators.
         """
         polynomials = self._polynomials(position)
         step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
         if isinstance(step, FailedStep) and step.has_doubtful_event:
+            doubtful = step
             self._tell_rejected(times, polynomials, _INF, f"{step.reason} after a restore")
-            step = self._stepper.attempt(position.history, times, polynomials, position.outputs)
+            step = self._stepper.attempt(
+                position.history, times, polynomials, position.outputs, careful=True
+            )
+            if not isinstance(step, FailedStep) or step.status is not StepStatus.EARLY_RETURN:
+                self._tell_lost_events(doubtful)
         if isinstance(step, FailedStep) and step.missing is not None:
             self._missing.note(step.missing, times.middle)
             self._tell_rejected(times, polynomials, _INF, step.reason)
             without = position._replace(history=position.history.without_slopes())
             return self._attempt(without, times)
         return position, polynomials, step
+
+    def _tell_lost_events(self, doubtful: FailedStep) -> None:
+        """The same step from the same state has ended otherwise; said once for each slave."""
+        if doubtful.slave in self._loses_events:
+            return
+        self._loses_events.add(doubtful.slave)
+        log.warning(
+            "%s: a step from a restored state returned early at t=%r s, and did not when it was "
+            "taken again: its saved states lack the past of its events, so that one may be missed; "
+            'state = "fork" in its table saves all of it',
+            doubtful.slave,
+            doubtful.time,
+        )
 
     def _accept(
         self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
@@ -375,6 +402,7 @@ class ControlledRun:
             controller,
             bracket.after_acceptance(times.end),
             smooth,
+            crossings=max(position.crossings - 1, 0),
         )
 
     def _reject(
@@ -525,9 +553,44 @@ class ControlledRun:
     ) -> Position:
         """Where to go on: the past says nothing any more."""
         behind = Position(history.cut(), _end(step), position.step_size, self._restarted_order())
+        if self._limits.quantum is not None:
+            order = OrderMemory(self._settings.polynomial)
+            behind = behind._replace(order=order, crossings=sum(self._crossings_behind_event))
         if step.times.end >= self._settings.end:
             return behind
         return self._with_initial_step_size(behind, position.step_size)
+
+    @property
+    def _crossings_behind_event(self) -> tuple[int, int]:
+        """Double steps of a grid until all slaves know of an event, and until polynomials have all
+        their points.
+
+        Each communication point hands a value on by one slave with direct feed-through.
+        """
+        points = self._estimator.points(self._settings.polynomial.order + 1)
+        return (self._coupled.at_point.highest + 1) // 2, (points + 1) // 2
+
+    def _accept_behind_event(
+        self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
+    ) -> Position:
+        """Cross what follows an event: with the smallest H of a grid there is no other way."""
+        statistics = self._statistics
+        if not statistics.steps_above_tolerance:
+            log.warning(
+                "behind an event, at t=%r s, a double step is kept with ERR = %.3g, most of it "
+                "from %s: its polynomials have no past, and H cannot be below %r s; "
+                "steps_above_tolerance in summary.json counts such steps",
+                step.times.begin,
+                error.norm,
+                error.limiting_variable,
+                step.times.step_size,
+            )
+        statistics.steps_above_tolerance += 1
+        statistics.double_steps_at_discontinuities += 1
+        following = self._accept(position, step, error, defects)
+        if following.crossings >= self._crossings_behind_event[1]:
+            return following._replace(history=following.history.cut())
+        return following
 
     def _search_change(
         self, position: Position, step: DoubleStep, error: StepError, target: float

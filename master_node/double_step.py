@@ -19,6 +19,7 @@ has the one over the whole double step, so that the estimates see what polynomia
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,11 +34,13 @@ from master_node.outputs import NO_OUTPUTS, Outputs
 from master_node.slave_group import SlaveGroup
 from master_node.step_requests import (
     RESTORE_HALFWAY,
+    RESTORE_HALFWAY_AND_KEEP,
     RESTORE_POINT,
     SAVE_HALFWAY,
     BrokenOffError,
     FailedStep,
     Piece,
+    RequestForm,
     StepForm,
 )
 from master_node.system import CoupledSystem
@@ -101,12 +104,16 @@ class DoubleStepper:
         if scheme.known_ahead:
             comparison = solution
         if self._is_long_step:
-            first = forms(StepForm(None, comparison), StepForm((RESTORE_POINT,), solution))
-            second = forms(StepForm((), solution))
+            first = StepForm(None, comparison), StepForm((RESTORE_POINT,), solution)
+            second = careful = StepForm((), solution)
         else:
-            first = forms(StepForm(None, solution), StepForm((SAVE_HALFWAY,), comparison))
-            second = forms(StepForm((RESTORE_HALFWAY,), solution))
-        self._first_request, self._second_request = first, second
+            first = StepForm(None, solution), StepForm((SAVE_HALFWAY,), comparison)
+            second = StepForm((RESTORE_HALFWAY,), solution)
+            careful = StepForm((RESTORE_HALFWAY_AND_KEEP,), solution)
+        self._first_request, self._second_request = forms(*first), forms(second)
+        self._careful_first_requests = [form for step in first for form in forms(step)]
+        self._careful_second_request = forms(careful)
+        self._is_careful = False
 
     def attempt(
         self,
@@ -114,6 +121,8 @@ class DoubleStepper:
         times: DoubleStepTimes,
         polynomials: Polynomials,
         begin: Outputs = NO_OUTPUTS,
+        *,
+        careful: bool = False,
     ) -> DoubleStep | FailedStep:
         """One double step from the newest point of ``history``.
 
@@ -122,6 +131,8 @@ class DoubleStepper:
             times: of the double step.
             polynomials: of the inputs, for each kind.
             begin: outputs at T_n, for the discrete inputs.
+            careful: whether a first step from a restored state that returns early is taken again,
+                which costs a round trip and keeps one more state.
 
         Returns:
             The solution, or why there is none. Unless `accepted` follows, the next attempt goes
@@ -130,6 +141,7 @@ class DoubleStepper:
         Raises:
             DoublestepError: a slave is lost, or failed in a way that a smaller step cannot help.
         """
+        self._is_careful = careful
         try:
             return self._attempt(history, times, polynomials, begin)
         except BrokenOffError as broken_off:
@@ -176,9 +188,7 @@ class DoubleStepper:
                 held,
                 DoStep(begin, size, True),
             )
-            comparison, at_middle = self._requests.take(
-                self._first_request, (comparison_piece, small_piece)
-            )
+            comparison, at_middle = self._first_steps(comparison_piece, small_piece)
         else:
             comparison_piece = Piece(
                 lambda _: in_first.end,
@@ -186,9 +196,7 @@ class DoubleStepper:
                 held,
                 DoStep(middle, second, False),
             )
-            at_middle, comparison = self._requests.take(
-                self._first_request, (small_piece, comparison_piece)
-            )
+            at_middle, comparison = self._first_steps(small_piece, comparison_piece)
 
         y_middle = at_middle.y
         d_middle = discrete.filled(at_middle.d, outputs.d)
@@ -201,7 +209,10 @@ class DoubleStepper:
             discrete.held(y_middle[0], d_middle, middle),
             DoStep(middle, second, False),
         )
-        (at_end,) = self._requests.take(self._second_request, (second_piece,))
+        if self._is_careful:
+            (at_end,) = self._carefully(self._careful_second_request, second_piece)
+        else:
+            (at_end,) = self._requests.take(self._second_request, (second_piece,))
         return DoubleStep(
             times,
             polynomials,
@@ -213,6 +224,22 @@ class DoubleStepper:
             (in_first.end[0], in_second.end[0]),
             (d_middle, discrete.filled(at_end.d, d_middle)),
         )
+
+    def _first_steps(self, first: Piece, second: Piece) -> list[Outputs]:
+        """All that depends only on what is known at T_n."""
+        if not self._is_careful:
+            return self._requests.take(self._first_request, (first, second))
+        pairs = zip(self._careful_first_requests, (first, second), strict=True)
+        return [outputs for form, piece in pairs for outputs in self._carefully([form], piece)]
+
+    def _carefully(self, forms: Sequence[RequestForm], piece: Piece) -> list[Outputs]:
+        """A step by itself; once more if a slave returns early in it right behind a restore."""
+        try:
+            return self._requests.take(forms, (piece,))
+        except BrokenOffError as broken_off:
+            if not broken_off.failed.has_doubtful_event:
+                raise
+        return self._requests.take(forms, (piece,))
 
     def _without_derivative(self, middle: FloatArray) -> FailedStep:
         """The second small step cannot have the polynomials of the first one."""

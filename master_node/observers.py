@@ -179,7 +179,8 @@ class Statistics:
         changes_at_smallest_step_size: changes of discrete outputs that are handed over late by more
             than the tolerance, or by an unknown error, because H cannot be smaller.
         steps_above_tolerance: double steps, or single ones where no slave has rollback, that had
-            ERR above 1 when it was too late to reject them.
+            ERR above 1 when it was too late to reject them, or behind an event on a grid of steps,
+            where H could not be smaller.
         time: the last accepted communication point [s].
         smallest_step_size, largest_step_size: over accepted steps [s]; NaN before the first.
     """

@@ -42,6 +42,7 @@ SAVE_POINT = GetState(_AT_POINT)
 RESTORE_POINT = SetState(_AT_POINT)
 SAVE_HALFWAY = GetState(_HALFWAY)
 RESTORE_HALFWAY = SetState(_HALFWAY, free=True)
+RESTORE_HALFWAY_AND_KEEP = SetState(_HALFWAY)
 
 
 @dataclass(frozen=True, slots=True)

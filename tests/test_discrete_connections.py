@@ -193,11 +193,11 @@ def test_an_early_return_is_an_event(capability_dir: Path, in_process: bool) -> 
 
 @pytest.mark.parametrize("estimator", ["mod", "rich"])
 def test_an_early_return_that_does_not_repeat_is_no_event(
-    capability_dir: Path, estimator: str
+    capability_dir: Path, estimator: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Saved states that lack the past of the event indicators: the first step after a restore
-    returns early, once. It is taken again, and the run is that of an FMU without this fault, step
-    by step: history, order and H are kept.
+    returns early, once, at T_n as well as halfway. It is taken again, and the run is that of an FMU
+    without this fault, step by step: history, order and H are kept. The user is told once.
     """
     results = [
         simulate(
@@ -215,6 +215,9 @@ def test_an_early_return_that_does_not_repeat_is_no_event(
     assert np.array_equal(right["model.y"], faulty["model.y"])
     rejected = faulty.steps[~faulty.steps["accepted"]]
     assert "model: early_return after a restore" in rejected["limiting_variable"].tolist()
+    told = [r.getMessage() for r in caplog.records if "returned early" in r.getMessage()]
+    assert len(told) == 1
+    assert 'state = "fork"' in told[0]
 
 
 def mapped(folder: Path, source: str, target: str, mapping: dict[Any, Any], **more: Any) -> System:

@@ -206,7 +206,7 @@ def test_the_command_line_chooses_for_all_slaves(
     file = tmp_path / "system.toml"
     file.write_text(
         (EXAMPLES / "displacement_python.toml")
-        .read_text()
+        .read_text(encoding="utf-8")
         .replace('"quarter_car.py', f'"{EXAMPLES}/quarter_car.py')
         .replace("[slaves.wheel]", '[slaves.wheel]\nstate = "native"')
     )
@@ -237,9 +237,9 @@ def test_inspect_says_how_and_why(capability_dir: Path) -> None:
     text = subprocess.run(
         [*command, str(capability_dir / "wheel_bare.fmu")],
         capture_output=True,
-        text=True,
+        encoding="utf-8",
         check=True,
-        env={**os.environ, "COLUMNS": "300"},
+        env={**os.environ, "COLUMNS": "300", "PYTHONUTF8": "1"},
     ).stdout
     assert "saved by forking the process that holds the model" in text
     assert "does not declare that it can save its state" in text

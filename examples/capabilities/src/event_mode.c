@@ -3,7 +3,7 @@
  * next of these times; without, it passes over them and the level rises on the way. With
  * ROUNDS_EVENTS a step that ends a rounding before an event returns early at the event. With
  * LOSES_INDICATORS saved states lack the sign of the event indicator: after a restore from an event
- * that was not handled the first step returns early after an internal step of 1 ms, for nothing.
+ * the first step returns early after an internal step of 1 ms, for nothing.
  */
 #include "lag.h"
 
@@ -17,7 +17,6 @@ typedef struct {
     Lag lag;
     int32_t level;
     int32_t event_is_due; /* the last step ended at an event */
-    int32_t indicator;    /* 1: behind that event, in this instance */
 } State;
 
 static Variable find(void *block, Type type, uint32_t reference)
@@ -38,7 +37,6 @@ static void rise(State *state)
     state->level += 1;
     state->lag.u = state->level;
     state->event_is_due = 0;
-    state->indicator = 0;
 }
 
 static Outcome step_up(void *block, void *hidden, Step *step)
@@ -51,8 +49,9 @@ static Outcome step_up(void *block, void *hidden, Step *step)
     }
     double now = step->t;
 #ifdef LOSES_INDICATORS
-    const bool seems_to_change = state->indicator != 0;
-    state->indicator = 0;
+    int32_t *passed = hidden; /* the level whose end the last step has reached, and 1 */
+    const bool seems_to_change = *passed == state->level + 1;
+    *passed = 0;
     if (seems_to_change && step->stop_at_events && now + 1e-3 < step->reached) {
         lag_advance(&state->lag, 1e-3);
         step->event = true;
@@ -70,8 +69,10 @@ static Outcome step_up(void *block, void *hidden, Step *step)
         now = event;
         if (step->stop_at_events) {
             state->event_is_due = 1;
-            state->indicator = 1;
             step->event = true;
+#ifdef LOSES_INDICATORS
+            *passed = state->level + 1;
+#endif
             step->reached = event;
             return STEP_TAKEN;
         }
@@ -90,26 +91,11 @@ static bool update(void *block, double time, double *next)
     return false; /* x does not jump */
 }
 
-#ifdef LOSES_INDICATORS
-static const char *restore(void *block, void *hidden, const void *saved)
-{
-    State *state = block;
-    const int32_t indicator = state->indicator;
-    (void)hidden;
-    *state = *(const State *)saved;
-    state->indicator = indicator;
-    return NULL;
-}
-#define RESTORE restore
-#else
-#define RESTORE NULL
-#endif
-
 const Behaviour behaviour = {.state_size = sizeof(State),
+                             .hidden_size = sizeof(int32_t),
                              .start = lag_start,
                              .find = find,
                              .initialized = lag_initialized,
                              .calculate = lag_calculate,
                              .step = step_up,
-                             .update = update,
-                             .restore = RESTORE};
+                             .update = update};
