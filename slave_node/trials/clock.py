@@ -1,5 +1,6 @@
-"""Internal clocks: of many small steps, which move an output?
+"""Internal clocks: of many small steps, which move a continuous output?
 
+Discrete outputs do not count: what changes at events is no clock of the others, and in no estimate.
 A model that moves only at multiples of a time is found by steps that are shorter than this; two of
 the moments are then bisected.
 """
@@ -8,6 +9,8 @@ from __future__ import annotations
 
 from contextlib import suppress
 from itertools import pairwise
+
+import numpy as np
 
 from slave_node.trials.steps import Place, Reading, TrialError, freed
 
@@ -65,8 +68,8 @@ def _moves(place: Place, size: float) -> list[bool] | None:
     moves: list[bool] = []
     while len(moves) < (3 * _STEPS if any(moves) else _STEPS):
         following = place.step(size)
-        has_moved = not following.equals(last)
-        if has_moved and not _matters(place, last, following):
+        has_moved = _differ(last, following)
+        if has_moved and place.trial.norm(last, following) <= _NO_MATTER:
             return None
         moves.append(has_moved)
         last = following
@@ -75,9 +78,8 @@ def _moves(place: Place, size: float) -> list[bool] | None:
     return moves
 
 
-def _matters(place: Place, last: Reading, following: Reading) -> bool:
-    """Whether what moved is more than rounding, or than what the tolerance hides."""
-    return last.others != following.others or place.trial.norm(last, following) > _NO_MATTER
+def _differ(last: Reading, following: Reading) -> bool:
+    return not np.array_equal(last.values, following.values)
 
 
 def _clear_ticks(moves: list[bool]) -> list[int]:
@@ -108,7 +110,7 @@ def _tick(place: Place, size: float, index: int) -> float:
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             here.restored()
-            moved = not here.step(middle).equals(last)
+            moved = _differ(last, here.step(middle))
             low, high = (low, middle) if moved else (middle, high)
     return index * size + 0.5 * (low + high)
 
