@@ -44,7 +44,6 @@ from protocol.keys import (
     SlaveKey,
     alive_agents,
 )
-from protocol.plain_text import printable
 from protocol.slave import SlaveDescription
 from protocol.slave_processes import end_error
 
@@ -55,6 +54,8 @@ _STATUS_TIME = 1.0
 _START_TIME = 30.0
 _STOP_TIME = 10.0
 _PAUSE = 0.1
+_MAX_AGENTS = 256
+_AT_ONCE = 8
 _ARRIVAL_TIME = 0.6  # who waits for a master tries again every 0.2 s
 _CHECK_PERIOD = 0.5
 
@@ -196,13 +197,12 @@ class Agents:
             return None
         agent = placed.agent
         remedy = (
-            f"see {printable(output.log)} on {printable(agent.host)}"
+            f"see {output.log} on {agent.host}"
             if output.log
             else f"start the agent {agent.name} with --logs DIR to keep all that it said"
         )
-        lines = [printable(line) for line in output.lines]
-        error = end_error(name, output.exit_code, lines, remedy)
-        error.cause = f"on {printable(agent.host)} (agent {agent.name}): {error.cause}"
+        error = end_error(name, output.exit_code, output.lines, remedy)
+        error.cause = f"on {agent.host} (agent {agent.name}): {error.cause}"
         if self._placed.get(name) is not placed:
             return None  # it was started again meanwhile, and this was about the one before
         self._ended[name] = error
@@ -239,22 +239,22 @@ class Agents:
             try:
                 decode_record(Done, reply.result())
             except DoublestepError as error:
-                log.warning("an agent did not end its slaves: %s", printable(str(error)))
+                log.warning("an agent did not end its slaves: %s", error)
 
     def _seen(self) -> list[SeenAgent]:
-        """The agents on the bus that answer, all asked at once."""
+        """The agents on the bus that answer, some asked at once: answers are held till then."""
         tokens = self._bus.alive(alive_agents(), _TOKEN_TIME)
-        keys = [key for key in map(AgentKey.from_alive, tokens) if key is not None]
-        pending = []
-        for key in keys:
-            caller = self._bus.caller(key.status, _STATUS_TIME)
-            pending.append((key, caller.send(b"")))
+        keys = [key for key in map(AgentKey.from_alive, tokens) if key is not None][:_MAX_AGENTS]
         seen = []
-        for key, reply in pending:
-            try:
-                seen.append(SeenAgent(key, decode_record(AgentStatus, reply.result())))
-            except DoublestepError as error:
-                log.warning("agent %s: %s", printable(key.name), printable(str(error)))
+        for i in range(0, len(keys), _AT_ONCE):
+            callers = [
+                (k, self._bus.caller(k.status, _STATUS_TIME)) for k in keys[i : i + _AT_ONCE]
+            ]
+            for key, reply in [(key, caller.send(b"")) for key, caller in callers]:
+                try:
+                    seen.append(SeenAgent(key, decode_record(AgentStatus, reply.result())))
+                except DoublestepError as error:
+                    log.warning("agent %s: %s", key.name, error)
         return seen
 
     def _start_on_first(self, suitable: Sequence[SeenAgent], wanted: WantedModel) -> SlaveKey:
@@ -271,7 +271,7 @@ class Agents:
         busy = [reason for reason in reasons if isinstance(reason, SlaveBusyError)]
         wrong = [reason for reason in reasons if isinstance(reason, ConfigurationError)]
         first = (busy or wrong or reasons)[0]
-        first.cause = printable("; ".join(reason.cause for reason in reasons))
+        first.cause = "; ".join(reason.cause for reason in reasons)
         raise first
 
     def _start_on(self, seen: SeenAgent, wanted: WantedModel) -> SlaveKey:
@@ -303,21 +303,18 @@ class Agents:
         self._used.add(seen.key)
         started = ask_agent(self._bus, seen.key, START, request, SlaveStarted, timeout=_START_TIME)
         self._placed[wanted.slave] = _Placed(seen.status, seen.key, sha256)
-        where = printable(f"{seen.key.name} on {seen.status.host}")
-        log.info("%s is started by agent %s", wanted.slave, where)
+        log.info("%s is started by agent %s on %s", wanted.slave, seen.key.name, seen.status.host)
         return SlaveKey(wanted.slave, started.instance)
 
     def _nobody(
         self, name: str, settings: SlaveSettings, seen: Sequence[SeenAgent]
     ) -> SlaveLostError:
         there = "; ".join(
-            printable(
-                f"{s.key.name} on {s.status.host}, which "
-                + (
-                    "lacks " + ", ".join(lacking)
-                    if (lacking := s.status.lacks(settings.requires))
-                    else "has another name"
-                )
+            f"{s.key.name} on {s.status.host}, which "
+            + (
+                "lacks " + ", ".join(lacking)
+                if (lacking := s.status.lacks(settings.requires))
+                else "has another name"
             )
             for s in seen
         )
@@ -350,7 +347,7 @@ def _suitable(seen: Sequence[SeenAgent], settings: SlaveSettings) -> list[SeenAg
         if names[s.key.name] > 1:
             places = [f"{o.status.host}/{o.status.pid}" for o in seen if o.key.name == s.key.name]
             raise ProtocolError(
-                f"{len(places)} agents are called {s.key.name!r}: {printable(', '.join(places))}",
+                f"{len(places)} agents are called {s.key.name!r}: {', '.join(places)}",
                 remedy="end all but one of them",
             )
     licence = settings.requires.get(LICENCE, "")

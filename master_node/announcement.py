@@ -11,6 +11,7 @@ from protocol.administration import MasterStatus
 from protocol.bus import Bus
 from protocol.codec import encode_map
 from protocol.keys import MasterKey
+from protocol.text_limits import cut
 
 
 def announce_run(bus: Bus, run: str, system: System) -> None:
@@ -23,8 +24,8 @@ def announce_run(bus: Bus, run: str, system: System) -> None:
             run,
             socket.gethostname(),
             os.getpid(),
-            system.source,
-            ", ".join(system.slaves),
+            cut(system.source),
+            cut(", ".join(system.slaves)),
             since,
             time.time(),
         )

@@ -800,7 +800,7 @@ def configuration_error(
     sentences = [_sentence(detail, known_keys) for detail in told]
     if len(mistakes) > len(told):
         sentences.append(f"and {len(mistakes) - len(told)} more mistakes")
-    return ConfigurationError("\n".join(f"{source}: {text}" for text in sentences))
+    return ConfigurationError.of_mistakes([f"{source}: {text}" for text in sentences])
 
 
 def _place(detail: ErrorDetails) -> tuple[str, ...]:

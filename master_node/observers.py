@@ -266,7 +266,7 @@ class Exchange(NamedTuple):
 
     Attributes:
         slave: its name.
-        request: ``epoch:sequence``, as in the slave's log; "" without a bus.
+        request: ``claim:sequence``, as in the slave's log; "" without a bus.
         program: what was asked.
         sent, received: by the monotonic clock of the master (`time.perf_counter`) [s].
         compute_time: that the slave spent on it [s]; NaN when there is no reply.

@@ -12,6 +12,7 @@ from protocol.bus import Bus
 from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.errors import DoublestepError, ProtocolError, SlaveLostError
 from protocol.keys import SlaveKey, alive_slaves
+from protocol.names import some
 
 log = logging.getLogger("master_node")
 
@@ -19,6 +20,7 @@ _POLL_TIME = 0.02
 _GRACE_TIME = 0.1  # a process that is just dying is soon known to be dead
 _LIVELINESS_TIME = 1.0
 _END_TIME = 5.0
+_SHOWN_INSTANCES = 4
 
 
 class Presence:
@@ -91,9 +93,10 @@ class Presence:
             keys_there = (k for k in map(SlaveKey.from_alive, tokens) if k is not None)
             instances = [k for k in keys_there if _is_called(name, k)]
             if len(instances) > 1:
+                places = [self._whereabouts(k) for k in instances[:_SHOWN_INSTANCES]]
+                more = ", ..." if len(instances) > _SHOWN_INSTANCES else ""
                 raise ProtocolError(
-                    f"{len(instances)} instances of {name!r}: "
-                    + ", ".join(self._whereabouts(k) for k in instances),
+                    f"{len(instances)} instances of {name!r}: {', '.join(places)}{more}",
                     slave=name,
                     remedy="end all but one of them",
                 )
@@ -133,7 +136,7 @@ class Presence:
     def _not_found(
         missing: list[str], started: Collection[str], alive: set[SlaveKey], timeout: float
     ) -> SlaveLostError:
-        there = ", ".join(sorted({k.name for k in alive})) or "no slave at all"
+        there = some(sorted({k.name for k in alive})) or "no slave at all"
         loading = all(name in started for name in missing)
         return SlaveLostError(
             f"did not appear within {timeout:g} s; found on the bus: {there}",

@@ -6,8 +6,9 @@ import os
 import socket
 from collections.abc import Sequence
 from contextlib import suppress
+from secrets import token_hex
 
-from protocol.administration import Claim
+from protocol.administration import Claim, Claimed, claim_name
 from protocol.bus import Bus, Caller, PendingReply
 from protocol.calls import Call, Reply
 from protocol.clock import SYSTEM_CLOCK, Clock
@@ -84,16 +85,18 @@ class RemoteSlave:
         self._calls: Sequence[Call] = ()
         self._payload = b""
         self._pending: PendingReply | None = None
-        self._claim = Claim(run, socket.gethostname(), os.getpid(), orphan_time(reconnect_time))
+        wait = orphan_time(reconnect_time)
+        self._claim = Claim(run, socket.gethostname(), os.getpid(), wait, token_hex(16))
         self._take()
 
     def _take(self) -> None:
         """Claim it."""
         caller = self._bus.caller(self._key.verb(CLAIM), _CLAIM_TIME)
-        answer = decode_map(caller.request(encode_map(self._claim.to_message())))
-        self._epoch = int(answer["epoch"])
+        data = caller.request(encode_map(self._claim.to_message()))
+        claimed = Claimed.from_message(decode_map(data))
+        self._epoch, self._claim_name = claimed.epoch, claim_name(claimed.epoch)
         self._sequence = 0
-        self._process = PeerProcess(str(answer.get("host", "")), int(answer.get("pid", 0)))
+        self._process = PeerProcess(claimed.host, claimed.pid)
 
     def _caller(self) -> Caller:
         return self._bus.caller(self._key.verb(EXECUTE), self._step_timeout)
@@ -116,7 +119,7 @@ class RemoteSlave:
     @property
     def request(self) -> str:
         """See `SlaveLink`."""
-        return f"{self._epoch}:{self._sequence}"
+        return f"{self._claim_name}:{self._sequence}"
 
     def start(self, calls: Sequence[Call]) -> None:
         """See `SlaveLink`."""

@@ -20,7 +20,7 @@ class SlaveLink(Protocol):
 
     @property
     def request(self) -> str:
-        """``epoch:sequence`` of the last program; "" without a bus."""
+        """``claim:sequence`` of the last program; "" without a bus."""
         ...
 
     def start(self, calls: Sequence[Call]) -> None:

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
+from protocol.administration import STATUS_BYTES
 from protocol.bus import DEFAULT_ENDPOINT, Bus
 from protocol.credentials import Credentials
 from protocol.endpoints import Endpoints, Mode
@@ -67,7 +68,8 @@ def windows(
     with ExitStack() as stack:
         made = []
         if listen:
-            bus = ZenohBus(Endpoints(tuple(listen), (), insecure, Mode.PEER, credentials))
+            endpoints = Endpoints(tuple(listen), (), insecure, Mode.PEER, credentials)
+            bus = ZenohBus(endpoints, largest=STATUS_BYTES)
             stack.callback(bus.close)
             made.append(Window(", ".join(listen), True, bus))
         with ThreadPoolExecutor(_AT_ONCE) as pool:
@@ -83,6 +85,7 @@ def windows(
 def _open(endpoints: Endpoints) -> Window:
     (where,) = endpoints.connect
     try:
-        return Window(where, False, ZenohBus(endpoints, timeout=_CONNECT_TIME))
+        bus = ZenohBus(endpoints, timeout=_CONNECT_TIME, largest=STATUS_BYTES)
     except DoublestepError as error:
         return Window(where, False, None, error)
+    return Window(where, False, bus)

@@ -7,15 +7,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
+from hashlib import sha256
 from typing import Any, Final, Self
 
 from protocol.errors import MalformedMessageError
 from protocol.keys import check_name
 from protocol.slave import StartValue
+from protocol.text_limits import MAX_HOST
 
 DEFAULT_ORPHAN_TIME: Final = 15.0
 """How long a slave waits for a master that does not say how long [s]."""
+
+STATUS_BYTES: Final = 4 * 2**20
+"""Length of the largest status that is taken, that of an agent with hundreds of slaves."""
 
 MAX_ORPHAN_TIME: Final = 3600.0
 """A vanished master can keep a slave from others no longer than this [s]."""
@@ -29,12 +34,14 @@ class Claim:
         run: id of the run.
         host, pid: the master's process.
         orphan_time: how long the slave waits for a master that vanished [s]; None: as it likes.
+        secret: known to this master alone, as everybody can see the id of its run.
     """
 
     run: str
     host: str
     pid: int
     orphan_time: float | None = None
+    secret: str = field(default="", repr=False)
 
     def to_message(self) -> dict[str, StartValue | None]:
         """As plain data."""
@@ -43,6 +50,7 @@ class Claim:
             "host": self.host,
             "pid": self.pid,
             "orphan_time": self.orphan_time,
+            "secret": self.secret,
         }
 
     @classmethod
@@ -54,11 +62,65 @@ class Claim:
             ConfigurationError: the id of the run is not valid.
         """
         run, host, pid = message.get("run"), message.get("host"), message.get("pid")
-        if type(run) is not str or type(host) is not str or type(pid) is not int:
+        secret = message.get("secret", "")
+        if not all(type(text) is str for text in (run, host, secret)) or type(pid) is not int:
             raise MalformedMessageError(
-                "a claim must hold run and host as texts, and pid as a number"
+                "a claim must hold run, host and secret as texts, and pid as a number"
             )
-        return cls(check_name(run, "run id"), host, pid, _orphan_time(message.get("orphan_time")))
+        orphan_time = _orphan_time(message.get("orphan_time"))
+        name = check_name(str(run), "run id")
+        return cls(name, check_host(str(host)), pid, orphan_time, str(secret))
+
+
+@dataclass(frozen=True, slots=True)
+class Claimed:
+    """A slave says that it was taken.
+
+    Attributes:
+        epoch: of all requests of this run.
+        host, pid: the slave's process.
+    """
+
+    epoch: int
+    host: str
+    pid: int
+
+    def to_message(self) -> dict[str, StartValue | None]:
+        """As plain data."""
+        return asdict(self)
+
+    @classmethod
+    def from_message(cls, message: Mapping[str, StartValue]) -> Self:
+        """What ``to_message`` wrote.
+
+        Raises:
+            MalformedMessageError: a value is missing or has another type.
+        """
+        epoch, host, pid = (message.get(name) for name in ("epoch", "host", "pid"))
+        if type(epoch) is not int or type(host) is not str or type(pid) is not int:
+            raise MalformedMessageError(
+                "the answer to a claim must hold epoch and pid as numbers, and host as a text"
+            )
+        return cls(epoch, check_host(host), pid)
+
+
+def claim_name(epoch: int) -> str:
+    """Name of a claim in logs and traces, from which the epoch cannot be told.
+
+    An epoch is enough to drive the slave in the place of its master.
+    """
+    return sha256(str(epoch).encode()).hexdigest()[:8]
+
+
+def check_host(host: str) -> str:
+    """``host`` itself if it is no longer than the name of a host can be.
+
+    Raises:
+        MalformedMessageError: it is longer.
+    """
+    if len(host) > MAX_HOST:
+        raise MalformedMessageError(f"host has {len(host)} characters; the limit is {MAX_HOST}")
+    return host
 
 
 def _orphan_time(value: StartValue | None) -> float | None:
@@ -90,11 +152,13 @@ class _Status:
             MalformedMessageError: a value is missing or has another type.
         """
         values: dict[str, Any] = {}
-        for field in fields(cls):  # type: ignore[arg-type]  # of a dataclass below
-            value = message.get(field.name)
-            if type(value).__name__ not in str(field.type).replace("None", "NoneType").split(" | "):
-                raise MalformedMessageError(f"a status must hold {field.name} as {field.type}")
-            values[field.name] = value
+        for one in fields(cls):  # type: ignore[arg-type]  # of a dataclass below
+            value = message.get(one.name)
+            if type(value).__name__ not in str(one.type).replace("None", "NoneType").split(" | "):
+                raise MalformedMessageError(f"a status must hold {one.name} as {one.type}")
+            if one.name == "host":
+                check_host(str(value))
+            values[one.name] = value
         return cls(**values)
 
 

@@ -19,6 +19,9 @@ from protocol.keys import check_name
 CHUNK_BYTES: Final = 2**20
 """Length of all pieces of an upload but the last."""
 
+AGENT_MESSAGE_BYTES: Final = 2 * CHUNK_BYTES
+"""Length of the largest message to an agent: a piece of an upload and what is around it."""
+
 LICENCE: Final = "licence"
 """The label whose values can be counted."""
 

@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 from protocol.errors import SlaveLostError
+from protocol.room import Room
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a master and slaves that were started by hand meet when nobody says otherwise."""
@@ -63,11 +64,23 @@ class Bus(ABC):
         """For requests to ``key``, each answered within ``timeout`` seconds or failed."""
 
     @abstractmethod
-    def serve(self, key: str, handler: Handler) -> None:
-        """Let ``handler`` answer the requests to ``key``, on a thread of its own."""
+    def serve(self, key: str, handler: Handler, room: Room | None = None) -> None:
+        """Let ``handler`` answer the requests to ``key``, on a thread of its own.
+
+        A request for which there is no room is dropped: its sender gets an empty answer,
+        and may send it again.
+
+        Args:
+            key: of the requests.
+            handler: answers them, one at a time.
+            room: for those that wait and the one that is being served; None: `SMALL_ROOM` of its
+                own. May be shared with other keys.
+        """
 
     @abstractmethod
-    def serve_here(self, key: str, handler: Handler, ready: Callable[[], None]) -> None:
+    def serve_here(
+        self, key: str, handler: Handler, ready: Callable[[], None], room: Room | None = None
+    ) -> None:
         """The same on the calling thread, for the hot path; returns when the bus is closed.
 
         ``ready`` is called once requests to ``key`` will be answered.
@@ -106,11 +119,17 @@ class InProcessBus(Bus):
         """See `Bus`."""
         return _InProcessCaller(self, key)
 
-    def serve(self, key: str, handler: Handler) -> None:
-        """See `Bus`."""
+    def serve(self, key: str, handler: Handler, room: Room | None = None) -> None:  # noqa: ARG002
+        """See `Bus`; a request is a call here, and does not wait."""
         self._handlers[key] = (handler, threading.Lock())
 
-    def serve_here(self, key: str, handler: Handler, ready: Callable[[], None]) -> None:
+    def serve_here(
+        self,
+        key: str,
+        handler: Handler,
+        ready: Callable[[], None],
+        room: Room | None = None,  # noqa: ARG002  as above
+    ) -> None:
         """See `Bus`."""
         self.serve(key, handler)
         ready()

@@ -28,7 +28,7 @@ well-formed or a `MalformedMessageError`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import lru_cache
 from struct import Struct
 from typing import Any, Final, NamedTuple, TypeVar
@@ -73,7 +73,8 @@ from protocol.calls import (
     SetState,
     StepResult,
 )
-from protocol.errors import DoublestepError, MalformedMessageError, VersionError
+from protocol.errors import DoublestepError, MalformedMessageError, ModelError, VersionError
+from protocol.keys import is_name
 from protocol.signals import MAX_ORDER, FloatArray
 from protocol.slave import (
     Capabilities,
@@ -89,11 +90,13 @@ from protocol.slave import (
     Variable,
     VariableType,
 )
+from protocol.text_limits import MAX_HOST, MAX_NAME, MAX_SENTENCE, cut
 
 PROTOCOL_VERSION: Final = 1
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
 MAX_CALLS: Final = 64
 MAX_COLUMNS: Final = 200_000
+MAX_FIELDS: Final = 64
 _MAX_CONTAINERS: Final = 500_000
 _SMALL_MESSAGE: Final = 2**10
 
@@ -102,11 +105,22 @@ _ONE = Struct("<d")
 _TWO = Struct("<dd")
 
 
+def check_length(data: bytes, what: str) -> None:
+    """Refuse a message beyond the limit; also before it is sent.
+
+    Raises:
+        MalformedMessageError: it is too long.
+    """
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise MalformedMessageError(
+            f"{what} of {len(data)} bytes; the limit is {MAX_MESSAGE_BYTES}"
+        )
+
+
 def _unpack(data: bytes, what: str) -> Any:
     """MessagePack data as plain objects, within the limits."""
+    check_length(data, what)
     size = len(data)
-    if size > MAX_MESSAGE_BYTES:
-        raise MalformedMessageError(f"{what} of {size} bytes; the limit is {MAX_MESSAGE_BYTES}")
     try:
         hook = None if size <= _SMALL_MESSAGE else _counter(data, what)
         return msgpack.unpackb(
@@ -215,10 +229,35 @@ def _boolean(value: Any, what: str) -> bool:
     raise MalformedMessageError(f"{what} must be true or false, not {_shown(value)}")
 
 
-def _text(value: Any, what: str) -> str:
+def _string(value: Any, what: str) -> str:
     if type(value) is str:
         return value
     raise MalformedMessageError(f"{what} must be a string, not {_shown(value)}")
+
+
+def _text_up_to(limit: int) -> Callable[[Any, str], str]:
+    """Checks a text of at most ``limit`` characters."""
+
+    def check(value: Any, what: str) -> str:
+        text = _string(value, what)
+        if len(text) > limit:
+            raise MalformedMessageError(f"{what} has {len(text)} characters; the limit is {limit}")
+        return text
+
+    return check
+
+
+_host = _text_up_to(MAX_HOST)
+_name = _text_up_to(MAX_NAME)
+_sentence = _text_up_to(MAX_SENTENCE)
+
+
+def _key_part(value: Any, what: str) -> str:
+    """The name of a participant, which becomes a part of keys."""
+    text = _string(value, what)
+    if not is_name(text):
+        raise MalformedMessageError(f"{_shown(text)} is not a valid {what}")
+    return text
 
 
 def _binary(value: Any, what: str) -> bytes:
@@ -227,9 +266,15 @@ def _binary(value: Any, what: str) -> bytes:
     raise MalformedMessageError(f"{what} must be bytes, not {_shown(value)}")
 
 
-def _texts(value: Any, what: str) -> tuple[str, ...]:
+def _sentences(value: Any, what: str) -> tuple[str, ...]:
     if type(value) is list and len(value) <= MAX_COLUMNS:
-        return tuple(_text(item, what) for item in value)
+        return tuple(_sentence(item, what) for item in value)
+    raise MalformedMessageError(f"{what} must be a list of strings, not {_shown(value)}")
+
+
+def _names(value: Any, what: str) -> tuple[str, ...]:
+    if type(value) is list and len(value) <= MAX_COLUMNS:
+        return tuple(_name(item, what) for item in value)
     raise MalformedMessageError(f"{what} must be a list of strings, not {_shown(value)}")
 
 
@@ -257,7 +302,7 @@ def _values(value: Any, what: str) -> tuple[StartValue, ...]:
 
 
 def _mapping(value: Any, what: str) -> dict[str, Any]:
-    if type(value) is dict and all(type(key) is str for key in value):
+    if type(value) is dict and all(type(key) is str and len(key) <= MAX_NAME for key in value):
         return value
     raise MalformedMessageError(f"{what} must be a map by name, not {_shown(value)}")
 
@@ -266,12 +311,12 @@ def _start_values(value: Any, what: str) -> dict[str, StartValue]:
     return {name: _start_value(item, what) for name, item in _mapping(value, what).items()}
 
 
-def _texts_by_name(value: Any, what: str) -> dict[str, str]:
-    return {name: _text(item, what) for name, item in _mapping(value, what).items()}
+def _sentences_by_name(value: Any, what: str) -> dict[str, str]:
+    return {name: _sentence(item, what) for name, item in _mapping(value, what).items()}
 
 
 def _dependencies(value: Any, what: str) -> dict[str, tuple[str, ...]]:
-    return {name: _texts(item, what) for name, item in _mapping(value, what).items()}
+    return {name: _names(item, what) for name, item in _mapping(value, what).items()}
 
 
 # --- calls --------------------------------------------------------------------------------------
@@ -280,22 +325,22 @@ _Check = Callable[[Any, str], Any]
 
 _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
     Configure: {
-        "state_kind": _text,
+        "state_kind": _name,
         "structural_parameters": _start_values,
         "largest_substep": _optional_number,
         "input_substeps": _integer,
         "max_input_order": _integer,
-        "not_repeating": _texts,
+        "not_repeating": _names,
     },
     Initialize: {
         "start_time": _number,
         "stop_time": _optional_number,
         "relative_tolerance": _optional_number,
         "start_values": _start_values,
-        "inputs": _texts,
-        "outputs": _texts,
-        "discrete_inputs": _texts,
-        "discrete_outputs": _texts,
+        "inputs": _names,
+        "outputs": _names,
+        "discrete_inputs": _names,
+        "discrete_outputs": _names,
         "early_return": _boolean,
     },
     Examine: {
@@ -308,8 +353,8 @@ _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
         "input_changes": _numbers,
         "input_order": _integer,
         "output_derivatives": _boolean,
-        "connected": _texts,
-        "not_repeating": _texts,
+        "connected": _names,
+        "not_repeating": _names,
     },
     SetInputs: {"derivatives": _array},
     SetDiscreteInputs: {"values": _values},
@@ -581,7 +626,17 @@ def decode_single(cls: type[Call], data: bytes) -> Call:
 
 
 def encode_reply(reply: Reply) -> bytes:
-    """A reply as bytes."""
+    """A reply as bytes; where it is beyond the limits, an error that says why, without results."""
+    try:
+        data = _encoded(reply)
+        check_length(data, "a reply")
+    except (ModelError, MalformedMessageError) as error:
+        return encode_error(error)
+    return data
+
+
+def _encoded(reply: Reply) -> bytes:
+    """Raises `ModelError` where a name in a description is too long."""
     error = None if reply.error is None else reply.error.to_reply()
     shape: list[Any] = []
     numbers: list[_Part] = []
@@ -607,9 +662,48 @@ def _plain(result: object) -> Any:
         return [len(result), result.astype(_LITTLE_ENDIAN, copy=False).tobytes()]
     if isinstance(result, StepResult):
         return [result.status.value, result.time]
-    if isinstance(result, SlaveDescription | Examination):
-        return asdict(result)
+    if isinstance(result, SlaveDescription):
+        return asdict(_within_limits(result))
+    if isinstance(result, Examination):
+        return asdict(_with_short_sentences(result))
     return result
+
+
+def _with_short_sentences(examination: Examination) -> Examination:
+    """An examination with its sentences cut."""
+    return replace(
+        examination,
+        state_reason=cut(examination.state_reason),
+        input_refusal=cut(examination.input_refusal),
+        not_tried=cut(examination.not_tried),
+        poor_derivatives={n: cut(why) for n, why in examination.poor_derivatives.items()},
+    )
+
+
+def _within_limits(description: SlaveDescription) -> SlaveDescription:
+    """A description with its sentences cut; names must travel whole.
+
+    Raises:
+        ModelError: a name is too long.
+    """
+    names = [description.model, description.guid, *description.units]
+    for variable in description.variables:
+        names += (variable.name, variable.unit, *variable.items)
+    if longest := max(names, key=len)[MAX_NAME:]:
+        raise ModelError(
+            f"a name in its description has {MAX_NAME + len(longest)} characters; the limit is "
+            f"{MAX_NAME}"
+        )
+    return replace(
+        description,
+        variables=tuple(
+            v if len(v.description) <= MAX_SENTENCE else replace(v, description=cut(v.description))
+            for v in description.variables
+        ),
+        state_reason=cut(description.state_reason),
+        remarks=tuple(map(cut, description.remarks)),
+        generation_tool=cut(description.generation_tool, MAX_NAME),
+    )
 
 
 def encode_error(error: DoublestepError) -> bytes:
@@ -622,7 +716,12 @@ def encode_single_reply(reply: Reply) -> bytes:
     answer: dict[str, Any] = {"result": _plain(reply.results[-1]) if reply.results else None}
     if reply.error is not None:
         answer["error"] = reply.error.to_reply()
-    return _pack(answer)
+    data = _pack(answer)
+    try:
+        check_length(data, "a reply")
+    except MalformedMessageError as error:
+        return _pack({"result": None, "error": error.to_reply()})
+    return data
 
 
 def decode_reply(calls: Sequence[Call], data: bytes) -> Reply:
@@ -753,14 +852,14 @@ def _description(value: Any) -> SlaveDescription:
 
 
 _VARIABLE_FIELDS: Mapping[str, _Check] = {
-    "name": _text,
+    "name": _name,
     "causality": lambda value, _: _member(Causality, value),
     "type": lambda value, _: _member(VariableType, value),
-    "variability": _text,
-    "unit": _text,
+    "variability": _name,
+    "unit": _name,
     "start": lambda value, what: None if value is None else _start_value(value, what),
     "nominal": _number,
-    "description": _text,
+    "description": _sentence,
     "minimum": _bound,
     "maximum": _bound,
     "items": _items,
@@ -774,40 +873,40 @@ _CAPABILITY_FIELDS: Mapping[str, _Check] = {
     "outputs_follow_inputs": _boolean,
 }
 _DESCRIPTION_FIELDS: Mapping[str, _Check] = {
-    "model": _text,
-    "kind": _text,
+    "model": _name,
+    "kind": _name,
     "variables": _variables,
     "capabilities": _capabilities,
     "feed_through": _dependencies,
     "initial_feed_through": _dependencies,
     "state_kind": lambda value, _: _member(StateKind, value),
-    "state_reason": _text,
+    "state_reason": _sentence,
     "input_derivatives": lambda value, _: _member(InputDerivatives, value),
     "fixed_step_size": _optional_number,
     "default_step_size": _optional_number,
     "units": lambda value, what: {
         name: _unit(item, what) for name, item in _mapping(value, what).items()
     },
-    "remarks": _texts,
-    "sha256": _text,
-    "guid": _text,
-    "generation_tool": _text,
+    "remarks": _sentences,
+    "sha256": _name,
+    "guid": _name,
+    "generation_tool": _name,
 }
 
 
 _EXAMINATION_FIELDS: Mapping[str, _Check] = {
     "state_verdict": lambda value, _: _member(StateVerdict, value),
-    "state_reason": _text,
+    "state_reason": _sentence,
     "has_moved": _boolean,
     "difference": _number,
     "internal_clock": _optional_number,
     "step_dependence": _number,
     "largest_substep": _optional_number,
     "input_order": lambda value, what: None if value is None else _integer(value, what),
-    "input_refusal": _text,
-    "not_repeating": _texts,
-    "poor_derivatives": _texts_by_name,
-    "not_tried": _text,
+    "input_refusal": _sentence,
+    "not_repeating": _names,
+    "poor_derivatives": _sentences_by_name,
+    "not_tried": _sentence,
 }
 
 
@@ -827,7 +926,15 @@ def decode_map(data: bytes) -> dict[str, StartValue]:
         MalformedMessageError: not a flat map.
         DoublestepError: what the map reports, if it is an error reply.
     """
-    return {name: _start_value(v, name) for name, v in _message(data).items() if v is not None}
+    values = _message(data)
+    if len(values) > MAX_FIELDS:
+        raise MalformedMessageError(f"a message of {len(values)} fields; the limit is {MAX_FIELDS}")
+    return {name: _plain_value(v, name) for name, v in values.items() if v is not None}
+
+
+def _plain_value(value: Any, what: str) -> StartValue:
+    """A value of a flat map, whose texts are for people."""
+    return _sentence(value, what) if type(value) is str else _start_value(value, what)
 
 
 def _message(data: bytes) -> dict[str, Any]:
@@ -845,6 +952,10 @@ def encode_error_map(error: DoublestepError) -> bytes:
 
 
 # --- records: agents ----------------------------------------------------------------------------
+
+
+def _names_by_name(value: Any, what: str) -> dict[str, str]:
+    return {name: _name(item, what) for name, item in _mapping(value, what).items()}
 
 
 def _records(cls: Any, checks: Mapping[str, _Check]) -> _Check:
@@ -866,39 +977,45 @@ def _exit_code(value: Any, what: str) -> int | None:
 
 _RECORD_FIELDS: Mapping[type, Mapping[str, _Check]] = {
     AgentStatus: {
-        "name": _text,
-        "instance": _text,
-        "host": _text,
+        "name": _key_part,
+        "instance": _key_part,
+        "host": _host,
         "pid": _integer,
-        "labels": _texts_by_name,
-        "licences": _records(Licence, {"name": _text, "total": _integer, "holders": _texts}),
+        "labels": _names_by_name,
+        "licences": _records(Licence, {"name": _name, "total": _integer, "holders": _sentences}),
         "models": _integer,
         "upload_limit": _integer,
         "python": _boolean,
         "slaves": _records(
             AgentSlave,
-            {"name": _text, "instance": _text, "pid": _integer, "run": _text, "model": _text},
+            {
+                "name": _key_part,
+                "instance": _key_part,
+                "pid": _integer,
+                "run": _key_part,
+                "model": _name,
+            },
         ),
         "since": _number,
         "time": _number,
     },
-    ModelList: {"models": _records(AgentModel, {"name": _text, "sha256": _text, "size": _integer})},
-    Upload: {"sha256": _text, "size": _integer, "offset": _integer, "data": _binary},
+    ModelList: {"models": _records(AgentModel, {"name": _name, "sha256": _name, "size": _integer})},
+    Upload: {"sha256": _name, "size": _integer, "offset": _integer, "data": _binary},
     UploadState: {"received": _integer, "complete": _boolean},
     StartSlave: {
-        "run": _text,
-        "host": _text,
+        "run": _name,
+        "host": _host,
         "pid": _integer,
         "orphan_time": _number,
-        "slave": _text,
-        "model": _text,
-        "requires": _texts_by_name,
+        "slave": _name,
+        "model": _name,
+        "requires": _names_by_name,
         "restart": _integer,
     },
-    SlaveStarted: {"instance": _text, "pid": _integer},
-    StopRun: {"run": _text},
-    OutputRequest: {"run": _text, "slave": _text},
-    SlaveOutput: {"exit_code": _exit_code, "lines": _texts, "log": _text},
+    SlaveStarted: {"instance": _key_part, "pid": _integer},
+    StopRun: {"run": _name},
+    OutputRequest: {"run": _name, "slave": _name},
+    SlaveOutput: {"exit_code": _exit_code, "lines": _sentences, "log": _name},
     Done: {},
 }
 _R = TypeVar("_R", bound=Record)

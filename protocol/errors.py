@@ -1,5 +1,7 @@
 """The exception tree. Every error names slave, phase, t, H, cause and remedy as far as they apply.
 
+As a text an error is printable: much of it comes from peers and files.
+
 ::
 
     DoublestepError
@@ -26,8 +28,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Self
+
+from protocol.plain_text import printable
+from protocol.text_limits import cut
 
 _TEXT_FIELDS = ("slave", "phase", "remedy")
 _NUMBER_FIELDS = ("time", "step_size", "last_successful_time")
@@ -91,14 +96,14 @@ class DoublestepError(Exception):
             place += f", H={self.step_size!r} s"
         head = ": ".join(part for part in (self.slave, place.strip()) if part)
         text = f"{head}: {self.cause}" if head else self.cause
-        return f"{text}; {self.remedy}" if self.remedy else text
+        return printable(f"{text}; {self.remedy}" if self.remedy else text)
 
     def to_reply(self) -> dict[str, str | float]:
         """The error as plain data for an error reply."""
-        reply: dict[str, str | float] = {"error": type(self).__name__, "cause": _utf8(self.cause)}
+        reply: dict[str, str | float] = {"error": type(self).__name__, "cause": _sent(self.cause)}
         for name in _TEXT_FIELDS:
             if text := getattr(self, name):
-                reply[name] = _utf8(text)
+                reply[name] = _sent(text)
         for name in _NUMBER_FIELDS:
             number = getattr(self, name)
             if number is not None:
@@ -108,7 +113,7 @@ class DoublestepError(Exception):
     @staticmethod
     def from_reply(reply: Mapping[str, object]) -> DoublestepError:
         """The error that ``to_reply`` described; an unknown class becomes a ``ProtocolError``."""
-        texts = {key: value for key, value in reply.items() if isinstance(value, str)}
+        texts = {key: cut(value) for key, value in reply.items() if isinstance(value, str)}
         cls = _BY_NAME.get(texts.get("error", ""), ProtocolError)
         error = cls(texts.get("cause", "an error reply without a cause"))
         for name in _TEXT_FIELDS:
@@ -120,9 +125,24 @@ class DoublestepError(Exception):
 
 
 class ConfigurationError(DoublestepError):
-    """The system file, the command line or a model's use is wrong. No step was taken."""
+    """The system file, the command line or a model's use is wrong. No step was taken.
+
+    Attributes:
+        mistakes: the causes, where there are several; each is shown on a line of its own.
+    """
 
     exit_code = 2
+    mistakes: tuple[str, ...] = ()
+
+    @classmethod
+    def of_mistakes(cls, mistakes: Sequence[str]) -> Self:
+        """One error for all of them."""
+        error = cls("\n".join(mistakes))
+        error.mistakes = tuple(mistakes)
+        return error
+
+    def __str__(self) -> str:
+        return "\n".join(map(printable, self.mistakes)) or super().__str__()
 
 
 class ModelError(ConfigurationError):
@@ -214,9 +234,9 @@ class InterruptedRunError(DoublestepError):
     exit_code = 130
 
 
-def _utf8(text: str) -> str:
+def _sent(text: str) -> str:
     """``text`` as it can travel: a file name may hold what is no character."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+    return cut(cut(text).encode("utf-8", "backslashreplace").decode("utf-8"))
 
 
 def _tree(cls: type[DoublestepError]) -> list[type[DoublestepError]]:

@@ -40,18 +40,35 @@ _ROOT = "doublestep"
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,128}")
 
 
+def is_name(name: str) -> bool:
+    """True when ``name`` is safe as a part of a key and of a file name; see `check_name`."""
+    return _NAME.fullmatch(name) is not None and name not in (".", "..")
+
+
 def check_name(name: str, what: str = "slave name") -> str:
     """``name`` itself when it is safe as a part of a key and of a file name.
 
     Raises:
         ConfigurationError: anything but 1 to 128 of ``A-Z a-z 0-9 _ . -``, or ``.`` or ``..``.
     """
-    if not _NAME.fullmatch(name) or name in (".", ".."):
+    if not is_name(name):
         raise ConfigurationError(
             f"{name!r} is not a valid {what}",
             remedy="use 1 to 128 characters out of A-Z a-z 0-9 _ . -",
         )
     return name
+
+
+def _names_in(key: str, kind: str, count: int) -> list[str]:
+    """The names in the key of a liveliness token; none if it is no such key, or one is not valid.
+
+    Peers choose them, and they go into other keys and onto terminals.
+    """
+    root, _, rest = key.partition("/")
+    *names, last = rest.split("/")
+    is_token = root == _ROOT and names[:1] == [kind] and last == _ALIVE
+    names = names[1:]
+    return names if is_token and len(names) == count and all(map(is_name, names)) else []
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -83,10 +100,8 @@ class SlaveKey:
     @staticmethod
     def from_alive(key: str) -> SlaveKey | None:
         """The address in the key of a liveliness token; None when it is none of a slave."""
-        parts = key.split("/")
-        if len(parts) == 5 and parts[:2] == [_ROOT, "slaves"] and parts[4] == _ALIVE:
-            return SlaveKey(parts[2], parts[3])
-        return None
+        names = _names_in(key, "slaves", 2)
+        return SlaveKey(*names) if names else None
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -113,10 +128,8 @@ class AgentKey:
     @staticmethod
     def from_alive(key: str) -> AgentKey | None:
         """The address in the key of a liveliness token; None when it is none of an agent."""
-        parts = key.split("/")
-        if len(parts) == 5 and parts[:2] == [_ROOT, "agents"] and parts[4] == _ALIVE:
-            return AgentKey(parts[2], parts[3])
-        return None
+        names = _names_in(key, "agents", 2)
+        return AgentKey(*names) if names else None
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -138,10 +151,8 @@ class MasterKey:
     @staticmethod
     def from_alive(key: str) -> MasterKey | None:
         """The address in the key of a liveliness token; None when it is none of a master."""
-        parts = key.split("/")
-        if len(parts) == 4 and parts[:2] == [_ROOT, "masters"] and parts[3] == _ALIVE:
-            return MasterKey(parts[2])
-        return None
+        names = _names_in(key, "masters", 1)
+        return MasterKey(*names) if names else None
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -163,10 +174,8 @@ class RouterKey:
     @staticmethod
     def from_alive(key: str) -> RouterKey | None:
         """The address in the key of a liveliness token; None when it is none of a router."""
-        parts = key.split("/")
-        if len(parts) == 4 and parts[:2] == [_ROOT, "routers"] and parts[3] == _ALIVE:
-            return RouterKey(parts[2])
-        return None
+        names = _names_in(key, "routers", 1)
+        return RouterKey(*names) if names else None
 
 
 def alive_routers() -> str:

@@ -13,8 +13,10 @@ import sys
 from collections.abc import Mapping
 from datetime import datetime
 from enum import StrEnum
+from typing import Any
 
 from protocol.errors import DoublestepError
+from protocol.plain_text import printable
 
 
 class LogFormat(StrEnum):
@@ -26,7 +28,7 @@ class LogFormat(StrEnum):
 
 FIELDS = ("run", "slave", "request", "phase", "t", "H")
 """Of a JSON line beside time, level, logger and message, where they are known: id of the run,
-name of the slave, ``epoch:sequence``, call, communication point [s], step size [s]."""
+name of the slave, ``claim:sequence``, call, communication point [s], step size [s]."""
 
 
 _PACKAGES = ("protocol", "slave_node", "master_node")
@@ -54,7 +56,7 @@ class JsonFormatter(logging.Formatter):
             "time": when.isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": record.getMessage(),
+            "message": printable(record.getMessage()),
             **self._known,
         }
         for name in FIELDS:
@@ -64,6 +66,18 @@ class JsonFormatter(logging.Formatter):
         if record.exc_info:
             line["traceback"] = self.formatException(record.exc_info)
         return json.dumps(line, allow_nan=False)
+
+
+class TextFormatter(logging.Formatter):
+    """One line for a message: what is in it cannot begin another."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  named by logging
+        """See `logging.Formatter`."""
+        return printable(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802  as above
+        """See `logging.Formatter`: indented, as it has several lines."""
+        return "\n".join(f"  {printable(t)}" for t in super().formatException(ei).splitlines())
 
 
 def configure_logs(style: LogFormat, text_format: str, **known: object) -> None:
@@ -78,7 +92,7 @@ def configure_logs(style: LogFormat, text_format: str, **known: object) -> None:
     """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(
-        JsonFormatter(known) if style is LogFormat.JSON else logging.Formatter(text_format)
+        JsonFormatter(known) if style is LogFormat.JSON else TextFormatter(text_format)
     )
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     for package in _PACKAGES:
@@ -105,4 +119,4 @@ def about(error: DoublestepError) -> dict[str, object]:
 def _plain(value: object) -> object:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
-    return value if isinstance(value, str | int | float | bool) else str(value)
+    return value if isinstance(value, int | float | bool) else printable(str(value))

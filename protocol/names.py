@@ -1,4 +1,4 @@
-"""Suggestions for misspelt names."""
+"""Names in messages: what there is, and suggestions for misspelt ones."""
 
 from __future__ import annotations
 
@@ -15,3 +15,10 @@ def nearest(name: str, known: Iterable[str]) -> str:
     if 0 < len(names) <= 10:
         return f"; there is {', '.join(map(repr, names))}"
     return ""
+
+
+def some(names: Iterable[str], most: int = 20) -> str:
+    """Names with commas between them, in their order; how many more there are than ``most``."""
+    all_names = list(names)
+    more = f" and {len(all_names) - most} more" if len(all_names) > most else ""
+    return ", ".join(all_names[:most]) + more

@@ -16,6 +16,7 @@ from protocol.errors import ConfigurationError
 
 _AT_ONCE = 32
 _ALERT_TIME = 0.3  # a refusal of our certificate comes after the handshake
+_HELLO_TIME = 0.5
 
 
 class Reach(StrEnum):
@@ -24,6 +25,7 @@ class Reach(StrEnum):
     REACHED = "reached"
     NOT_REACHED = "not reached"
     REFUSED = "refused"
+    IS_TLS = "is TLS"
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +34,8 @@ class Probe:
 
     Attributes:
         endpoint: the address.
-        reach: how far it got; ``refused``: the two sides do not trust each other.
+        reach: how far it got; ``refused``: the two sides do not trust each other; ``is TLS``: the
+            other side wants certificates, and this one has none.
         cause: in words, empty when it was reached.
     """
 
@@ -41,11 +44,17 @@ class Probe:
     cause: str = ""
 
     def check(self) -> None:
-        """Go on unless the two sides do not trust each other.
+        """Go on unless the two sides will never come together.
 
         Raises:
-            ConfigurationError: they do not.
+            ConfigurationError: they do not trust each other, or only one of them speaks TLS.
         """
+        if self.reach is Reach.IS_TLS:
+            raise ConfigurationError(
+                f"{self.endpoint}: {self.cause}",
+                phase="connect",
+                remedy="name your certificates with --tls, or with tls in the [bus] table",
+            )
         if self.reach is Reach.REFUSED:
             raise ConfigurationError(
                 f"{self.endpoint}: {self.cause}",
@@ -83,6 +92,35 @@ def probe_all(
         return []
     with ThreadPoolExecutor(min(len(endpoints), _AT_ONCE)) as pool:
         return list(pool.map(lambda endpoint: probe(endpoint, credentials, timeout), endpoints))
+
+
+def probe_without_tls(endpoint: str, timeout: float) -> Probe:
+    """Find out whether who is at an endpoint wants TLS: only then a hello in TLS is answered.
+
+    Nothing is trusted, and nothing is said beyond the hello. Takes half a second where somebody is
+    there who does not speak TLS.
+
+    Args:
+        endpoint: as for `probe`.
+        timeout: bound on connecting [s].
+    """
+    try:
+        connection = socket.create_connection(host_and_port(endpoint), timeout)
+    except OSError as error:
+        return Probe(endpoint, Reach.NOT_REACHED, str(error.strerror or error))
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    with connection:
+        connection.settimeout(_HELLO_TIME)
+        try:
+            context.wrap_socket(connection).close()
+        except ssl.SSLError as error:
+            if "ALERT" not in str(error.reason):  # an alert is an answer in TLS
+                return Probe(endpoint, Reach.REACHED)
+        except OSError:  # it waits for more, or has left
+            return Probe(endpoint, Reach.REACHED)
+    return Probe(endpoint, Reach.IS_TLS, "it speaks TLS, and this side does not")
 
 
 def _shake_hands(

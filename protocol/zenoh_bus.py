@@ -4,6 +4,9 @@ Safe by default: no scouting, explicit endpoints (``endpoints.py``), and with ce
 has one of a role is heard (``access.py``).
 Requests are queries: one querier per key, one reply, collected from the query's own channel, so
 that several can be under way at once. Measured reasons for each setting: ``docs/decisions/``.
+
+What others send is bounded in bytes: a message (Zenoh drops longer ones unread), the requests that
+wait (``request_line.py``), the replies to a request (`_Pending`), the tokens that are looked at.
 """
 
 from __future__ import annotations
@@ -13,16 +16,19 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from weakref import WeakSet
 
 from protocol.access import access_control
 from protocol.bus import AliveListener, Bus, Caller, Handler, PendingReply
-from protocol.codec import MAX_MESSAGE_BYTES
+from protocol.codec import MAX_MESSAGE_BYTES, check_length
 from protocol.credentials import Credentials
 from protocol.endpoints import Endpoints, Mode
 from protocol.errors import ConfigurationError, DeadlineError, HostLimitError, SlaveLostError
-from protocol.reachability import Reach, probe_all
+from protocol.reachability import Probe, Reach, probe_all, probe_without_tls
+from protocol.request_line import Line
+from protocol.room import SMALL_ROOM, Room
 from protocol.threads import LIMITS, start_thread
 
 os.environ.setdefault(
@@ -41,13 +47,18 @@ _TIMEOUT_PAYLOAD = b"Timeout"
 _CLIENT_ATTEMPT_MS = 300
 _PROBE_TIME = 2.0
 _PROBE_PERIOD = 1.0
-_DROPPED_BYTES = 4 * MAX_MESSAGE_BYTES  # what is shorter is refused with an answer
+_ENVELOPE_BYTES = 2**16  # what Zenoh puts around a payload
 _MAX_TOKENS = 4096
+_MAX_WAITING = 32  # requests that Zenoh holds for a key; more wait on the network
+_MAX_REPLIES = 2  # one, and what Zenoh itself says at the timeout
+_MOST_AT_ONCE = 1000
+_PATIENCE = 0.1
+_ATTENTION = 0.01
 _CLOSE_TIME = 1.0
 _REQUESTS_A_TOKEN = 512
 
 
-def _config(endpoints: Endpoints) -> zenoh.Config:
+def _config(endpoints: Endpoints, largest: int) -> zenoh.Config:
     config = zenoh.Config()
     is_client = endpoints.mode is Mode.CLIENT
     settings: dict[str, object] = {
@@ -67,7 +78,8 @@ def _config(endpoints: Endpoints) -> zenoh.Config:
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": _LEASE_MS,
         "transport/link/tx/queue/size/data": 16,
-        "transport/link/rx/max_message_size": _DROPPED_BYTES,
+        "transport/link/rx/max_message_size": largest + _ENVELOPE_BYTES,
+        "transport/unicast/qos/enabled": False,  # else each link holds eight unfinished messages
         "transport/shared_memory/enabled": False,
     }
     if endpoints.credentials is not None:
@@ -96,18 +108,25 @@ def _secured(endpoints: Endpoints) -> tuple[str, ...]:
     return endpoints.connect if endpoints.credentials is not None else ()
 
 
-def _session(endpoints: Endpoints) -> zenoh.Session:
+def _probes(endpoints: Sequence[str], credentials: Credentials | None) -> list[Probe]:
+    """Why connections do not come about, of which Zenoh tells nothing."""
+    if credentials is None:
+        return [probe_without_tls(endpoint, _PROBE_TIME) for endpoint in endpoints]
+    return probe_all(endpoints, credentials, _PROBE_TIME)
+
+
+def _session(endpoints: Endpoints, largest: int) -> zenoh.Session:
     try:
-        return zenoh.open(_config(endpoints))
+        return zenoh.open(_config(endpoints, largest))
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # it has no other name, and no module
             raise
         raise HostLimitError(f"the bus cannot be opened: {error}", remedy=LIMITS) from error
 
 
-def _open(endpoints: Endpoints) -> zenoh.Session:
+def _open(endpoints: Endpoints, largest: int) -> zenoh.Session:
     try:
-        return _session(endpoints)
+        return _session(endpoints, largest)
     except zenoh.ZError as error:
         raise ConfigurationError(
             f"cannot open the bus at {', '.join(endpoints.listen)}: {_first_line(error)}",
@@ -116,7 +135,7 @@ def _open(endpoints: Endpoints) -> zenoh.Session:
 
 
 def _open_client(
-    endpoints: Endpoints, timeout: float | None, stop: threading.Event
+    endpoints: Endpoints, largest: int, timeout: float | None, stop: threading.Event
 ) -> zenoh.Session:
     """Try until a router is there; a short time each, as an attempt cannot be interrupted."""
     where = ", ".join(endpoints.connect)
@@ -125,13 +144,12 @@ def _open_client(
     while not stop.is_set():
         begin = time.monotonic()
         try:
-            return _session(endpoints)
+            return _session(endpoints, largest)
         except zenoh.ZError:
             if not told:
                 log.info("waiting for a router at %s", where)
                 told = True
-            attempts = probe_all(_secured(endpoints), endpoints.credentials, _PROBE_TIME)
-            for attempt in attempts:
+            for attempt in _probes(endpoints.connect, endpoints.credentials):
                 attempt.check()
         if end is not None and time.monotonic() > end:
             raise SlaveLostError(
@@ -150,6 +168,7 @@ class ZenohBus(Bus):
         endpoints: where to listen and to connect.
         timeout: how long a client waits for its router [s]; None: for ever.
         stop: when it is set, a client waits no more.
+        largest: length of the largest message that is received [bytes]; Zenoh drops longer ones.
 
     Raises:
         ConfigurationError: an address cannot be listened on, or who is there does not accept our
@@ -162,6 +181,7 @@ class ZenohBus(Bus):
         endpoints: Endpoints,
         timeout: float | None = None,
         stop: threading.Event | None = None,
+        largest: int = MAX_MESSAGE_BYTES,
     ) -> None:
         zenoh.init_log_from_env_or("off")
         probes = probe_all(_secured(endpoints), endpoints.credentials, _PROBE_TIME)
@@ -170,61 +190,98 @@ class ZenohBus(Bus):
         self._closing = threading.Event()
         self._close_lock = threading.RLock()
         self._threads: list[threading.Thread] = []
+        self._lines: list[Line[zenoh.Query]] = []
+        self._pending = _Pending()
         self._kept: list[object] = []
+        self._attends = False
         if endpoints.mode is Mode.CLIENT:
-            self._session = _open_client(endpoints, timeout, stop or self._closing)
+            self._session = _open_client(endpoints, largest, timeout, stop or self._closing)
         else:
-            self._session = _open(endpoints)
-            left = [a.endpoint for a in probes if a.reach is not Reach.REACHED]
-            if left and endpoints.credentials is not None:
-                self._explain_later(left, endpoints.credentials)
+            self._session = _open(endpoints, largest)
+            left = [e for e in endpoints.connect if Probe(e, Reach.REACHED) not in probes]
+            if left:
+                self._explain_later(left, endpoints)
 
-    def _explain_later(self, endpoints: list[str], credentials: Credentials) -> None:
-        """Who was not there yet may turn out not to accept us, of which Zenoh tells nothing."""
+    def _explain_later(self, left: list[str], endpoints: Endpoints) -> None:
+        """Probe again whoever was not there yet: a connection to them may never come about."""
 
         def look() -> None:
-            left = endpoints
-            while left and not self._closing.wait(_PROBE_PERIOD):
-                attempts = probe_all(left, credentials, _PROBE_TIME)
+            remaining = left
+            while remaining and not self._closing.wait(_PROBE_PERIOD):
+                if endpoints.credentials is None and self._is_connected(len(endpoints.connect)):
+                    return
+                attempts = _probes(remaining, endpoints.credentials)
                 for attempt in attempts:
                     try:
                         attempt.check()
                     except ConfigurationError as error:
                         log.error("%s", error)
-                left = [a.endpoint for a in attempts if a.reach is Reach.NOT_REACHED]
+                remaining = [a.endpoint for a in attempts if a.reach is Reach.NOT_REACHED]
 
         start_thread(look, "reachability")
 
+    def _is_connected(self, number: int) -> bool:
+        """True when there are as many connections, or the session is closed."""
+        with suppress(zenoh.ZError):
+            info = self._session.info
+            return len(info.peers_zid()) + len(info.routers_zid()) >= number
+        return True  # closed
+
     def caller(self, key: str, timeout: float) -> Caller:
-        """See `Bus`."""
+        """See `Bus`. Of replies without number only the last is kept, until all are there."""
         with _closed_is_lost():
             querier = self._session.declare_querier(
-                key, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout
+                key, consolidation=zenoh.ConsolidationMode.LATEST, timeout=timeout
             )
-        return _ZenohCaller(querier, key, timeout)
+        self._begin_to_attend()
+        return _ZenohCaller(querier, key, timeout, self._pending)
 
-    def serve(self, key: str, handler: Handler) -> None:
+    def serve(self, key: str, handler: Handler, room: Room | None = None) -> None:
         """See `Bus`."""
-        with _closed_is_lost():
-            queryable = self._session.declare_queryable(key)
-        self._threads.append(start_thread(lambda: self._answer(queryable, handler), f"serve {key}"))
+        line = self._line(key, room)
+        self._threads.append(start_thread(lambda: self._answer(line, handler), f"serve {key}"))
 
-    def serve_here(self, key: str, handler: Handler, ready: Callable[[], None]) -> None:
-        """See `Bus`."""
-        with _closed_is_lost():
-            queryable = self._session.declare_queryable(key)
-        ready()
-        self._answer(queryable, handler)
-
-    def _answer(
-        self, queryable: zenoh.Queryable[zenoh.handlers.Handler[zenoh.Query]], handler: Handler
+    def serve_here(
+        self, key: str, handler: Handler, ready: Callable[[], None], room: Room | None = None
     ) -> None:
+        """See `Bus`."""
+        line = self._line(key, room)
+        ready()
+        self._answer(line, handler)
+
+    def _line(self, key: str, room: Room | None) -> Line[zenoh.Query]:
+        with _closed_is_lost():
+            queryable = self._session.declare_queryable(
+                key, zenoh.handlers.FifoChannel(_MAX_WAITING)
+            )
+        line = Line(queryable, room or Room(SMALL_ROOM), _size, _drop)
+        self._lines.append(line)
+        self._begin_to_attend()
+        return line
+
+    def _begin_to_attend(self) -> None:
+        with self._close_lock:
+            if not self._attends and not self._closing.is_set():
+                self._threads.append(start_thread(self._attend, "attention"))
+                self._attends = True
+
+    def _attend(self) -> None:
+        """Look after requests and replies that wait for long: Zenoh stands still behind them."""
+        period = _PATIENCE
+        while not self._closing.wait(period):
+            busy = self._pending.attend()
+            with suppress(zenoh.ZError):  # a queryable of a session that was closed
+                busy |= sum(line.attend(_PATIENCE) for line in list(self._lines)) > 0
+            period = _ATTENTION if busy else _PATIENCE
+
+    def _answer(self, line: Line[zenoh.Query], handler: Handler) -> None:
         try:
             while not self._closing.is_set():
-                query = queryable.recv()
+                query = line.next()
                 with query:
                     payload = query.payload
                     query.reply(query.key_expr, handler(b"" if payload is None else bytes(payload)))
+                del query, payload  # else held until the next one comes
         except zenoh.ZError:
             if not self._closing.is_set():
                 raise
@@ -235,12 +292,20 @@ class ZenohBus(Bus):
             self._kept.append(self._session.liveliness().declare_token(key))
 
     def alive(self, pattern: str, timeout: float) -> list[str]:
-        """See `Bus`."""
+        """See `Bus`. Of more than 4096 tokens the first that are heard of are there."""
+        keys: set[str] = set()
+        done = threading.Event()
+
+        def hear(reply: zenoh.Reply) -> None:
+            if reply.ok is not None and len(keys) < _MAX_TOKENS:
+                keys.add(str(reply.ok.key_expr))
+
+        # Not a channel: where it is full Zenoh waits within the call, for who would empty it.
+        handler = zenoh.handlers.Callback(hear, done.set, indirect=False)
         with _closed_is_lost():
-            replies = self._session.liveliness().get(
-                pattern, zenoh.handlers.FifoChannel(_MAX_TOKENS), timeout=timeout
-            )
-        return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+            self._session.liveliness().get(pattern, handler, timeout=timeout)
+        done.wait(timeout + _CLOSE_TIME)
+        return sorted(keys)
 
     def watch(self, pattern: str, listener: AliveListener) -> None:
         """See `Bus`."""
@@ -270,9 +335,33 @@ class ZenohBus(Bus):
                 thread.join(max(0.0, end - time.monotonic()))
 
 
+class _Pending:
+    """Replies that are still to be read; from any thread.
+
+    A slave can answer one request with any number of errors. Zenoh waits for room for them, and all
+    other replies with it, so they are taken from channels that are not being read.
+    """
+
+    def __init__(self) -> None:
+        self._replies: WeakSet[_ZenohReply] = WeakSet()
+        self._lock = threading.Lock()
+
+    def add(self, reply: _ZenohReply) -> None:
+        """One more, until it is dropped."""
+        with self._lock:
+            self._replies.add(reply)
+
+    def attend(self) -> bool:
+        """Take in what came; True if there was something."""
+        with self._lock:
+            replies = list(self._replies)
+        return sum(reply.take_in() for reply in replies) > 0
+
+
 class _ZenohCaller(Caller):
-    def __init__(self, querier: zenoh.Querier, key: str, timeout: float) -> None:
+    def __init__(self, querier: zenoh.Querier, key: str, timeout: float, pending: _Pending) -> None:
         self._querier = querier
+        self._pending = pending
         self.key = key
         self.timeout = timeout
         self._lock = threading.Lock()
@@ -281,14 +370,21 @@ class _ZenohCaller(Caller):
         self._left = _REQUESTS_A_TOKEN
 
     def send(self, payload: bytes) -> PendingReply:
+        check_length(payload, "a request")
         self._left -= 1
         if self._left == 0:
             self._renew_token()
         try:
-            channel = self._querier.get(payload=payload, cancellation_token=self._tokens[-1])
+            channel = self._querier.get(
+                zenoh.handlers.FifoChannel(_MAX_REPLIES),
+                payload=payload,
+                cancellation_token=self._tokens[-1],
+            )
         except zenoh.ZError as error:
             raise SlaveLostError(f"cannot ask {self.key}: {_first_line(error)}") from error
-        return _ZenohReply(channel, self)
+        reply = _ZenohReply(channel, self)
+        self._pending.add(reply)
+        return reply
 
     def _renew_token(self) -> None:
         """A token remembers all queries it was given to; the last two serve what is pending."""
@@ -314,18 +410,51 @@ class _ZenohReply(PendingReply):
     def __init__(self, channel: zenoh.handlers.Handler[zenoh.Reply], caller: _ZenohCaller) -> None:
         self._channel = channel
         self._caller = caller
+        self._lock = threading.Lock()
+        self._first: zenoh.Reply | None = None
+        self._is_read = False
+
+    def take_in(self) -> bool:
+        """Keep the first reply and drop others, unless they are being read; True if one came."""
+        count = 0
+        with self._lock, suppress(zenoh.ZError):  # there are no more
+            while not self._is_read and count < _MOST_AT_ONCE:
+                reply = self._channel.try_recv()
+                if reply is None:
+                    break
+                self._first = self._first or reply
+                count += 1
+        return count > 0
 
     def result(self) -> bytes:
+        with self._lock:
+            self._is_read = True
         try:
-            reply = self._channel.recv()
+            reply = self._first = self._first or self._channel.recv()
         except zenoh.ZError as error:
             raise SlaveLostError("no reply: it is not there, or went away") from error
+        finally:
+            self._is_read = False
         if reply.ok is not None:
             return reply.ok.payload.to_bytes()
         payload = b"" if reply.err is None else reply.err.payload.to_bytes()
         if payload == _TIMEOUT_PAYLOAD:
             raise DeadlineError(f"no reply within {self._caller.timeout:g} s")
         raise SlaveLostError(f"{self._caller.key} answered {payload[:200]!r}")
+
+
+def _size(query: zenoh.Query) -> int:
+    """Bytes that a request holds."""
+    payload, attachment, parameters = query.payload, query.attachment, query.parameters
+    size = 0 if payload is None else len(payload)
+    size += 0 if attachment is None else len(attachment)
+    return size if parameters.is_empty() else size + len(str(parameters))
+
+
+def _drop(query: zenoh.Query) -> None:
+    """Answer nothing."""
+    with query:
+        pass
 
 
 @contextmanager

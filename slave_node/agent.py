@@ -20,6 +20,7 @@ from shutil import rmtree
 from typing import TypeVar
 
 from protocol.agents import (
+    AGENT_MESSAGE_BYTES,
     LICENCE,
     AgentSlave,
     AgentStatus,
@@ -58,11 +59,12 @@ from protocol.keys import (
     alive_agents,
 )
 from protocol.processes import PeerProcess
+from protocol.room import Room
 from protocol.slave_processes import SlaveProcess, end_all
 from slave_node.ending import wait_for_end
 from slave_node.master_watch import Master, MasterWatch
 from slave_node.model_store import ModelStore
-from slave_node.upload_cache import UploadCache
+from slave_node.upload_cache import MAX_PARTS, UploadCache
 
 log = logging.getLogger("slave_node")
 
@@ -154,7 +156,7 @@ class Agent:
         models = self._offer.store.models()
         self._bus.serve(self._key.status, lambda _: encode_record(self.status()))
         self._serve(MODELS, lambda _: self.models())
-        self._serve_record(UPLOAD, Upload, self.upload)
+        self._serve_record(UPLOAD, Upload, self.upload, Room(MAX_PARTS * AGENT_MESSAGE_BYTES))
         self._serve_record(START, StartSlave, self.start)
         self._serve_record(STOP, StopRun, self.stop)
         self._serve_record(OUTPUT, OutputRequest, self.output)
@@ -175,7 +177,9 @@ class Agent:
         if self._offer.cache is not None:
             self._offer.cache.close()
 
-    def _serve(self, verb: str, handle: Callable[[bytes], Record]) -> None:
+    def _serve(
+        self, verb: str, handle: Callable[[bytes], Record], room: Room | None = None
+    ) -> None:
         def answer(data: bytes) -> bytes:
             try:
                 return encode_record(handle(data))
@@ -183,10 +187,16 @@ class Agent:
                 log.warning("%s refused: %s", verb, error)
                 return encode_error_map(error)
 
-        self._bus.serve(self._key.verb(verb), answer)
+        self._bus.serve(self._key.verb(verb), answer, room)
 
-    def _serve_record(self, verb: str, cls: type[_R], handle: Callable[[_R], Record]) -> None:
-        self._serve(verb, lambda data: handle(decode_record(cls, data)))
+    def _serve_record(
+        self,
+        verb: str,
+        cls: type[_R],
+        handle: Callable[[_R], Record],
+        room: Room | None = None,
+    ) -> None:
+        self._serve(verb, lambda data: handle(decode_record(cls, data)), room)
 
     def status(self) -> AgentStatus:
         """What it says of itself."""

@@ -7,7 +7,8 @@ stored, without a second effect; an old epoch is refused. No clock, no bus.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from hmac import compare_digest
 from secrets import randbelow
 
 from protocol.administration import DEFAULT_ORPHAN_TIME
@@ -26,6 +27,7 @@ class Holder:
         since: wall-clock time of its claim, for people.
         orphan_time: how long it is waited for when it vanished [s].
         claimed: time of its claim in seconds since 1970.
+        secret: who claims again for the same run must know it.
     """
 
     run: str
@@ -34,6 +36,12 @@ class Holder:
     since: str
     orphan_time: float = DEFAULT_ORPHAN_TIME
     claimed: float = 0.0
+    secret: str = field(default="", repr=False)
+
+    def is_again(self, other: Holder) -> bool:
+        """True when ``other`` is the same master, asking again."""
+        secrets = (self.secret.encode("utf-8", "replace"), other.secret.encode("utf-8", "replace"))
+        return self.run == other.run and compare_digest(*secrets)
 
     def __str__(self) -> str:
         return f"run {self.run} on {self.host} (pid {self.pid}) since {self.since}"
@@ -59,13 +67,13 @@ class Claims:
         return self._epoch
 
     def claim(self, holder: Holder) -> int:
-        """Give the slave to ``holder``; the same run asking again gets the same epoch.
+        """Give the slave to ``holder``; the same master asking again gets the same epoch.
 
         Raises:
-            SlaveBusyError: another run holds it.
+            SlaveBusyError: another master holds it.
         """
         if self._holder is not None:
-            if self._holder.run == holder.run:
+            if self._holder.is_again(holder):
                 return self._epoch
             raise SlaveBusyError(
                 f"busy: held by {self._holder}",

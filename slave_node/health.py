@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from protocol.bus import Bus
 from protocol.errors import SlaveLostError
-from protocol.keys import alive_agents, alive_routers, alive_slaves
+from protocol.keys import AgentKey, SlaveKey, alive_agents, alive_routers, alive_slaves
+from protocol.names import some
 
 _TOKEN_TIME = 1.0
 
@@ -25,9 +26,11 @@ def check_alive(bus: Bus, name: str, *, agent: bool = False) -> None:
         return
     if not name:
         raise SlaveLostError("no router is on the bus", phase="check")
-    there = sorted({key.split("/")[2] for key in bus.alive(alive_named("*"), _TOKEN_TIME)})
+    from_alive = AgentKey.from_alive if agent else SlaveKey.from_alive
+    keys = map(from_alive, bus.alive(alive_named("*"), _TOKEN_TIME))
+    there = some(sorted({key.name for key in keys if key is not None}))
     raise SlaveLostError(
-        f"is not on the bus; found there: {', '.join(there) or f'no {kind} at all'}",
+        f"is not on the bus; found there: {there or f'no {kind} at all'}",
         slave=name,
         phase="check",
     )

@@ -13,11 +13,18 @@ import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
 
-from protocol.administration import DEFAULT_ORPHAN_TIME, Claim, SlaveStatus
+from protocol.administration import (
+    DEFAULT_ORPHAN_TIME,
+    Claim,
+    Claimed,
+    SlaveStatus,
+    claim_name,
+)
 from protocol.bus import Bus
 from protocol.calls import CALLS, Call, Reply, Reset
 from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.codec import (
+    MAX_MESSAGE_BYTES,
     PROTOCOL_VERSION,
     decode_map,
     decode_reply,
@@ -47,6 +54,7 @@ from protocol.keys import (
     alive_slaves,
 )
 from protocol.processes import PeerProcess
+from protocol.room import Room
 from protocol.slave import SlaveDescription, StartValue
 from slave_node.claims import Claims, Holder
 from slave_node.master_watch import Master, MasterWatch
@@ -55,6 +63,8 @@ from slave_node.worker import Worker
 log = logging.getLogger("slave_node")
 
 _PEER_TIME = 1.0
+_ROOM = MAX_MESSAGE_BYTES + 2**20
+"""For the requests of masters, and for all verbs by hand: one of the largest, or many [bytes]."""
 
 
 class SlaveNode:
@@ -108,10 +118,11 @@ class SlaveNode:
         self._bus.serve(key.verb(ABORT), self._abort)
         self._bus.serve(key.verb(CLAIM), self._claim)
         self._bus.serve(key.verb(RELEASE), self._release)
+        by_hand = Room(_ROOM)
         for call in CALLS:
-            self._bus.serve(key.verb(call.verb), self._single(call))
+            self._bus.serve(key.verb(call.verb), self._single(call), by_hand)
         self._masters.start()
-        self._bus.serve_here(key.verb(EXECUTE), self._execute, self._announce)
+        self._bus.serve_here(key.verb(EXECUTE), self._execute, self._announce, Room(_ROOM))
 
     def _others(self) -> list[str]:
         """The tokens of slaves that are found by the same name."""
@@ -147,7 +158,7 @@ class SlaveNode:
             return self._worker.execute(program)
         except SlaveCrashedError as error:
             if self._worker_alive:
-                request = f"{epoch}:{sequence}" if sequence else ""
+                request = f"{claim_name(epoch)}:{sequence}" if sequence else ""
                 log.error("%s", error, extra={"request": request, **_about(self._claims.holder)})
             self._worker_alive = False
             return encode_error(error)
@@ -203,11 +214,14 @@ class SlaveNode:
         except DoublestepError as error:
             log.warning("claim refused: %s", error)
             return encode_error_map(error.located(slave=self._key.name, phase=CLAIM))
-        return encode_map({"epoch": epoch, "host": socket.gethostname(), "pid": os.getpid()})
+        claimed = Claimed(epoch, socket.gethostname(), os.getpid())
+        return encode_map(claimed.to_message())
 
     def _holder(self, claim: Claim) -> Holder:
         orphan_time = self._orphan_time if claim.orphan_time is None else claim.orphan_time
-        return Holder(claim.run, claim.host, claim.pid, _now(), orphan_time, time.time())
+        return Holder(
+            claim.run, claim.host, claim.pid, _now(), orphan_time, time.time(), claim.secret
+        )
 
     def _release(self, data: bytes) -> bytes:
         try:

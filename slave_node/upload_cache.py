@@ -27,7 +27,7 @@ log = logging.getLogger("slave_node")
 _IDLE_TIME = 600.0
 _GIVEN_UP_TIME = 10.0  # then an upload is in nobody's way any more
 _STALE_TIME = 86400.0
-_MAX_PARTS = 16
+MAX_PARTS = 16
 _SUFFIX = ".fmu"
 _PART_SUFFIX = ".part"
 
@@ -190,10 +190,10 @@ class UploadCache:
         for sha256, part in list(self._parts.items()):
             if now - part.touched > _IDLE_TIME:
                 self._drop(sha256)
-        while len(self._parts) >= _MAX_PARTS:
+        while len(self._parts) >= MAX_PARTS:
             if not self._drop_given_up(now):
                 raise SlaveBusyError(
-                    f"{_MAX_PARTS} models are being sent already", remedy="wait for these"
+                    f"{MAX_PARTS} models are being sent already", remedy="wait for these"
                 )
         files = self._whole()
         whole = sum(status.st_size for status in files.values())

@@ -16,6 +16,7 @@ from random import Random
 from protocol.bus import AliveListener, Bus, Caller, Handler, PendingReply
 from protocol.bus import matches as pattern_matches
 from protocol.errors import DeadlineError, SlaveLostError
+from protocol.room import Room
 from tests.virtual_clock import VirtualClock, Waiter
 
 
@@ -208,12 +209,14 @@ class FaultyBus(Bus):
         """See `Bus`."""
         return _FaultyCaller(self, key, timeout)
 
-    def serve(self, key: str, handler: Handler) -> None:
+    def serve(self, key: str, handler: Handler, room: Room | None = None) -> None:
         """See `Bus`."""
         service = self._services[key] = _Service(self._clock, handler)
         self._clock.start(service.work)
 
-    def serve_here(self, key: str, handler: Handler, ready: Callable[[], None]) -> None:
+    def serve_here(
+        self, key: str, handler: Handler, ready: Callable[[], None], room: Room | None = None
+    ) -> None:
         """See `Bus`."""
         service = self._services[key] = _Service(self._clock, handler)
         ready()

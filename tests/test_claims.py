@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -98,6 +100,21 @@ class Network(RuleBasedStateMachine):
 
 TestNetwork = Network.TestCase
 TestNetwork.settings = settings(max_examples=150, stateful_step_count=40)
+
+
+def test_who_knows_the_run_only_gets_no_epoch() -> None:
+    """The id of a run is on the bus for all to see: another master could go on in its place."""
+    claims = Claims()
+    master = replace(holder(), secret="a secret")
+    epoch = claims.claim(master)
+    assert claims.claim(master) == epoch
+    for secret in ("", "another", "a secret ", "ä"):
+        with pytest.raises(SlaveBusyError) as info:
+            claims.claim(replace(master, secret=secret))
+        assert "a secret" not in str(info.value)
+    assert "a secret" not in f"{master} {master!r}"
+    claims.release(epoch)
+    assert claims.claim(replace(master, secret="another")) != epoch
 
 
 def test_nobody_needs_to_be_asked_twice() -> None:

@@ -54,7 +54,7 @@ from master_node.study.configuration import (
 from master_node.study.configuration import ResultSettings as StudyResults
 from master_node.study.plan import Plan
 from master_node.study.table import StudyTable
-from protocol import codec, errors
+from protocol import codec, errors, text_limits
 from protocol.calls import CALLS
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState
 from protocol.signals import MAX_ORDER
@@ -509,6 +509,10 @@ def test_the_limits_are_those_of_the_program() -> None:
         "columns of an array": codec.MAX_COLUMNS,
         "rows of an array": MAX_ORDER + 1,
         "containers (maps and lists) in a message": codec._MAX_CONTAINERS,
+        "fields of an administrative message": codec.MAX_FIELDS,
+        "text: the host of a participant": text_limits.MAX_HOST,
+        "text: a name of a variable, unit, model, file": text_limits.MAX_NAME,
+        "text: a description, cause, remedy, remark": text_limits.MAX_SENTENCE,
         "saved states of a slave": LIMIT,
     }
 

@@ -9,8 +9,10 @@ import os
 import re
 import signal
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -137,7 +139,7 @@ def test_master_and_slave_log_json(start: Start, tmp_path: Path, endpoint: str) 
     (claimed,) = [line for line in lines if line["message"].startswith("claimed by")]
     (crashed,) = [line for line in lines if "SIGKILL" in line["message"]]
     assert claimed["run"] == crashed["run"] == last["run"]
-    assert re.fullmatch(r"\d+:\d+", crashed["request"])
+    assert re.fullmatch(r"[0-9a-f]{8}:\d+", crashed["request"])
     assert crashed["level"] == "error"
 
 
@@ -247,6 +249,49 @@ def test_a_slave_counts_what_goes_through_it() -> None:
     }
 
 
+def test_a_stranger_at_the_metrics_port_takes_little() -> None:
+    """Connections that say nothing are few and end; other methods and paths give nothing else."""
+    threads = threading.active_count()
+    with metrics_served(0, "127.0.0.1", lambda: (Metric("a", "b", "gauge", {"": 1.0}),)) as url:
+        port = int(url.split(":")[2].split("/")[0])
+        silent = [socket.create_connection(("127.0.0.1", port), 10.0) for _ in range(64)]
+        try:
+            turned_away = [s for s in silent if _has_ended(s)]
+            assert len(turned_away) >= 40
+            assert threading.active_count() <= threads + 1 + 16
+            for connection in silent:
+                connection.close()
+            wait_until(lambda: b"doublestep_a 1.0" in _said(port, b"GET /metrics"))
+            assert b"doublestep_a 1.0" in _said(port, b"GET /../../../etc/passwd")
+            for line in (b"POST /metrics", b"DELETE /", b"\xff\x00", b"GET " + b"/" * 70_000):
+                assert b"doublestep_a" not in _said(port, line)
+        finally:
+            for connection in silent:
+                connection.close()
+    wait_until(lambda: threading.active_count() <= threads)
+
+
+def _has_ended(connection: socket.socket) -> bool:
+    connection.settimeout(0.2)
+    try:
+        return connection.recv(1) == b""
+    except TimeoutError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def _said(port: int, line: bytes) -> bytes:
+    """The answer to a request, whatever it is."""
+    with socket.create_connection(("127.0.0.1", port), 10.0) as connection, suppress(OSError):
+        connection.sendall(line + b" HTTP/1.0\r\n\r\n")
+        answer = b""
+        while piece := connection.recv(65536):
+            answer += piece
+        return answer
+    return b""
+
+
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
 def test_metrics_of_a_run(start: Start, tmp_path: Path, endpoint: str) -> None:
     """Master and slave serve them on loopback, grow, and agree at the end of the run."""
@@ -330,9 +375,9 @@ def test_a_trace_has_every_request(in_process: bool, tmp_path: Path) -> None:
         numbers = [e["args"]["request"] for e in requests]
         if in_process:
             assert set(numbers) == {""}
-        else:  # one epoch, and no request left out
-            epoch, _, first = numbers[0].partition(":")
-            assert numbers == [f"{epoch}:{int(first) + i}" for i in range(len(requests))]
+        else:  # one claim, and no request left out
+            claim, _, first = numbers[0].partition(":")
+            assert numbers == [f"{claim}:{int(first) + i}" for i in range(len(requests))]
         assert all(e["args"]["H"] > 0.0 and e["args"]["t"] >= 0.0 for e in steps)
 
 

@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
 import socket
 import ssl
 import stat
+import threading
+import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zenoh
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
 
-from master_node import load_system, simulate
+from master_node import load_system, remote_slave, simulate
 from protocol.access import access_control
+from protocol.administration import claim_name
 from protocol.bus import Bus
 from protocol.credentials import Credentials, Role
-from protocol.endpoints import Endpoints, Mode
-from protocol.errors import ConfigurationError, SlaveLostError
+from protocol.endpoints import Endpoints, Mode, free_endpoint
+from protocol.errors import ConfigurationError, InterruptedRunError, SlaveLostError
 from protocol.keys import STATUS, MasterKey, SlaveKey, alive_slaves
-from protocol.reachability import Reach, probe
+from protocol.reachability import Reach, probe, probe_without_tls
 from protocol.zenoh_bus import ZenohBus
+from slave_node import certificates
 from slave_node.certificates import Host, make_certificates
 from tests.quarter_car_case import EXAMPLES
 from tests.test_network import Commands
 from tests.test_processes import system_file
+from tests.test_resume import Interrupt
 from tests.waiting import BOUND, wait_until
 
 pytestmark = [
@@ -196,8 +208,173 @@ def test_who_has_no_certificate_or_a_wrong_one_is_not_let_in(
         open_bus(Role.SLAVE, folder=strangers, connect=endpoint)
     with pytest.raises(ConfigurationError, match="not trusted"):
         open_bus(Role.SLAVE, Mode.CLIENT, strangers, connect=endpoint)
-    with pytest.raises(SlaveLostError, match="no connection to"):
-        ZenohBus(Endpoints(connect=(endpoint,), mode=Mode.CLIENT), timeout=0.5)  # without TLS
+    with pytest.raises(ConfigurationError, match=r"speaks TLS, and this side does not; .*--tls"):
+        ZenohBus(Endpoints(connect=(endpoint,), mode=Mode.CLIENT), timeout=BOUND)
+
+
+def test_who_speaks_no_tls_is_told_so(
+    open_bus: OpenBus, endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A peer tries again for ever; it says why in vain, and once. To a peer it says nothing."""
+    open_bus(Role.MASTER, listen=endpoint)
+    plain = free_endpoint()
+    buses = [ZenohBus(Endpoints(listen=(plain,))), ZenohBus(Endpoints(connect=(plain, endpoint)))]
+    try:
+        wait_until(lambda: "speaks TLS" in caplog.text)
+        (message,) = (record.getMessage() for record in caplog.records)
+        assert re.match(
+            rf"connect: {endpoint}: it speaks TLS, and this side does not; name", message
+        )
+    finally:
+        for bus in buses:
+            bus.close()
+    assert probe_without_tls(endpoint, BOUND).reach is Reach.IS_TLS
+    assert probe_without_tls(free_endpoint(), BOUND).reach is Reach.NOT_REACHED
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        where = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+        assert probe_without_tls(where, BOUND).reach is Reach.REACHED
+
+
+class LongAgo(datetime):
+    """The clock of certificates that have expired."""
+
+    @classmethod
+    def now(cls, tz: Any = None) -> datetime:
+        """Two years before."""
+        return datetime.now(tz) - timedelta(days=730)
+
+
+WRONG = {
+    "expired": r"certificate has expired",
+    "of another name": r"IP address mismatch",
+}
+
+
+@pytest.fixture
+def wrong(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Path, Path]:
+    """Certificates of one authority: those of a host that are wrong, and right ones."""
+    folder = tmp_path / "laboratory"
+    make_certificates(folder, [Host.parse("right")], ROLES, 30)
+    if request.param == "expired":
+        monkeypatch.setattr(certificates, "datetime", LongAgo)
+    else:
+        monkeypatch.setattr(certificates, "_LOOPBACK", ())
+    make_certificates(folder, [Host.parse("wrong=elsewhere.example")], ROLES, 30)
+    return folder / "wrong", folder / "right"
+
+
+def tls_context(folder: Path, role: Role, *, server: bool) -> ssl.SSLContext:
+    """One end of a connection, whatever its certificate is like."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
+    context.load_verify_locations(folder / "ca.pem")
+    context.load_cert_chain(folder / f"{role}.pem", folder / f"{role}-key.pem")
+    context.verify_mode = ssl.CERT_REQUIRED
+    return context
+
+
+@pytest.mark.parametrize("wrong", WRONG, indirect=True)
+def test_a_certificate_that_is_wrong_is_told_to_who_connects(
+    wrong: tuple[Path, Path], request: pytest.FixtureRequest
+) -> None:
+    """With the reason; not its authority but its time or its name is what is wrong."""
+    theirs, ours = wrong
+    cause = WRONG[request.node.callspec.params["wrong"]]
+    context = tls_context(theirs, Role.ROUTER, server=True)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        where = f"tls/127.0.0.1:{listening.getsockname()[1]}"
+
+        def serve() -> None:
+            connection, _ = listening.accept()
+            with connection, suppress(OSError):
+                context.wrap_socket(connection, server_side=True).close()
+
+        server = threading.Thread(target=serve)
+        server.start()
+        found = probe(where, Credentials(ours, Role.SLAVE), BOUND)
+        server.join(BOUND)
+    assert found.reach is Reach.REFUSED
+    with pytest.raises(ConfigurationError, match=rf"its certificate is not trusted: .*{cause}"):
+        found.check()
+
+
+@pytest.mark.parametrize("wrong", ["expired"], indirect=True)
+def test_an_expired_certificate_lets_nobody_in(
+    wrong: tuple[Path, Path], open_bus: OpenBus, endpoint: str
+) -> None:
+    """Neither who uses it as we do, which says so before anything opens, nor who does not look."""
+    theirs, ours = wrong
+    for role in ROLES:
+        with pytest.raises(
+            ConfigurationError, match=r"not valid here: certificate has expired.*clock"
+        ):
+            Credentials(theirs, role)
+    open_bus(Role.MASTER, folder=ours, listen=endpoint)
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    context = tls_context(theirs, Role.SLAVE, server=False)
+    with (
+        socket.create_connection((host, int(port)), BOUND) as connection,
+        pytest.raises(ssl.SSLError, match=r"(?i)certificate expired"),
+        context.wrap_socket(connection, server_hostname=host) as secure,
+    ):
+        secure.recv(1)
+
+
+def raw_session(folder: Path, name: str, endpoint: str) -> zenoh.Session:
+    """Zenoh with a certificate, without our software around it."""
+    config, tls = zenoh.Config(), "transport/link/tls"
+    for key, value in {
+        "mode": "client",
+        "connect/endpoints": [endpoint.replace("tcp/", "tls/")],
+        "scouting/multicast/enabled": False,
+        f"{tls}/root_ca_certificate": str(folder / "ca.pem"),
+        f"{tls}/connect_certificate": str(folder / f"{name}.pem"),
+        f"{tls}/connect_private_key": str(folder / f"{name}-key.pem"),
+        f"{tls}/enable_mtls": True,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+@pytest.mark.parametrize("name", ["", "admin", "Master", "master,slave"])
+def test_a_certificate_without_a_role_is_good_for_nothing(
+    name: str, open_bus: OpenBus, tmp_path: Path, endpoint: str
+) -> None:
+    """A valid certificate of our authority, nameless or of another name: not heard, not told."""
+    laboratory = tmp_path / "laboratory"
+    make_certificates(laboratory, [Host.parse("here")], ROLES, 30)
+    folder = laboratory / "here"
+    authority = certificates._Authority.at(laboratory)
+    key = ec.generate_private_key(ec.SECP256R1())
+    with pytest.MonkeyPatch.context() as patch:
+        if not name:
+            patch.setattr(NameOID, "COMMON_NAME", NameOID.LOCALITY_NAME)
+        made = authority.sign(name or "x", Host.parse("here"), key.public_key(), 30)  # type: ignore[arg-type]
+    (folder / "odd.pem").write_bytes(made)
+    (folder / "odd-key.pem").write_bytes(certificates._key_pem(key))
+    (folder / "odd-key.pem").chmod(0o600)
+    for path in ("odd.pem", "odd-key.pem"):
+        (folder / path.replace("odd", "slave")).write_bytes((folder / path).read_bytes())
+    with pytest.raises(ConfigurationError, match=rf"has the common name '{name}', not 'slave'"):
+        Credentials(folder, Role.SLAVE)
+    router = open_bus(Role.ROUTER, Mode.ROUTER, folder, listen=endpoint)
+    master = open_bus(Role.MASTER, Mode.CLIENT, folder, connect=endpoint)
+    serve_status(router, SLAVES[0])
+    wait_until(lambda: ask(master, SLAVES[0]) == b"a")
+    with raw_session(folder, "odd", endpoint) as session:
+        token = session.liveliness().declare_token(SLAVES[1].alive)
+        session.declare_queryable(
+            SLAVES[1].verb(STATUS), lambda query: query.reply(query.key_expr, b"odd")
+        )
+        heard = list(session.get(SLAVES[0].verb(STATUS), timeout=1.0))
+        assert not [reply.ok for reply in heard if reply.ok is not None]
+        tokens = list(session.liveliness().get(alive_slaves(), timeout=1.0))
+        seen = {str(reply.ok.key_expr) for reply in tokens if reply.ok is not None}
+        assert seen <= {SLAVES[1].alive}  # its own
+        assert ask(master, SLAVES[1]) is None
+        assert SLAVES[1].alive not in master.alive(alive_slaves(), BOUND)
+        assert token is not None
 
 
 # ---- What each may do ---------------------------------------------------------------------------
@@ -285,6 +462,42 @@ def test_a_run_over_tls_has_the_same_bits(
     assert (tmp_path / "out" / "results.csv").read_bytes() == (
         tmp_path / "same" / "results.csv"
     ).read_bytes()
+
+
+def test_no_secret_is_written(
+    laboratory: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Law: no key, no secret of a claim and no epoch is in a result, checkpoint, trace or log."""
+    secrets, names = {"a secret of the test"}, set[str]()
+
+    def named(epoch: int) -> str:
+        secrets.add(str(epoch))
+        names.add(claim_name(epoch))
+        return claim_name(epoch)
+
+    for path in laboratory.glob("*-key.pem"):
+        secrets |= {line for line in path.read_text().splitlines() if not line.startswith("-")}
+    monkeypatch.setattr(remote_slave, "token_hex", lambda _: "a secret of the test")
+    monkeypatch.setattr(remote_slave, "claim_name", named)
+    simulation = "stop_time = 1.0\ncheckpoint_interval = 1e-6\n"
+    system = load_system(
+        system_file(tmp_path, simulation=simulation, bus=f'tls = "{laboratory}"\n')
+    )
+    where: dict[str, Any] = {"output": tmp_path / "out", "trace": tmp_path / "out" / "trace.json"}
+    with pytest.raises(InterruptedRunError):
+        simulate(system, observers=(Interrupt(9),), **where)
+    assert len(names) == 2
+    written = {path.name: path.read_bytes() for path in where["output"].rglob("*.*")}
+    with zipfile.ZipFile(where["output"] / "checkpoint" / "run.zip") as archive:
+        written |= {name: archive.read(name) for name in archive.namelist()}
+    written["standard output and error"] = "".join(capfd.readouterr()).encode()
+    assert written.keys() >= {"trace.json", "summary.json", "system.json", "run.json", "wheel.log"}
+    assert all(name.encode() in written["trace.json"] for name in names)
+    found = [(name, s) for name, data in written.items() for s in secrets if s.encode() in data]
+    assert not found
 
 
 def test_a_slave_of_another_laboratory_is_refused(
