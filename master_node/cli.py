@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import logging
 import os
 import signal
@@ -22,6 +21,7 @@ from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunE
 from protocol.interruption import interruptible
 from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.standard_output import guarded_standard_output, output_of_others
+from protocol.terminal import say, say_error, say_json
 from protocol.threads import start_thread
 
 if TYPE_CHECKING:  # each command imports what it needs
@@ -246,10 +246,9 @@ def _refuse_beside_in_process(options: Mapping[str, object]) -> None:
 
 def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
     """What came out: a picture and the summary."""
-    from rich.console import Console  # noqa: PLC0415
-
     from master_node.progress import summary_table  # noqa: PLC0415
     from master_node.results import PLOT_FILE, Result  # noqa: PLC0415
+    from protocol.tables import show  # noqa: PLC0415
 
     result = Result.load(directory)
     if not no_plot:
@@ -257,9 +256,8 @@ def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
 
         plot_result(result, directory / PLOT_FILE, show=False, variables=None)
     if not quiet:
-        console = Console()
-        console.print(summary_table(result.summary))
-        console.print(f"results in {directory}", highlight=False)
+        show(summary_table(result.summary))
+        say(f"results in {directory}")
 
 
 @app.command()
@@ -329,7 +327,7 @@ def sweep(  # noqa: PLR0917  as above
                 replace=replace,
                 progress=StudyProgress(quiet=quiet),
             )
-    typer.echo(directory / TABLE_FILE)
+    say(directory / TABLE_FILE)
     if outcome.failed:
         raise typer.Exit(1)
 
@@ -355,7 +353,7 @@ def plot(
             plot_result(Result.load(directory), path, show=show, variables=variable or None)
     except KeyError as error:
         raise ConfigurationError(f"{directory}: {error.args[0]}", phase="plot") from None
-    typer.echo(path)
+    say(path)
 
 
 @app.command()
@@ -366,12 +364,11 @@ def compare(
     atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = 1e-6,
 ) -> None:
     """Compare two results, |A - B| <= atol + rtol |B|; exit code 1 when they differ."""
-    from rich.console import Console  # noqa: PLC0415
-
     from master_node.compare import compare as compare_results  # noqa: PLC0415
+    from protocol.tables import show  # noqa: PLC0415
 
     comparison = compare_results(a, b, rtol, atol)
-    Console().print(comparison.table())
+    show(comparison.table())
     if not comparison.within_tolerance:
         raise typer.Exit(1)
 
@@ -395,7 +392,7 @@ def import_(
     with interruptible():
         for note in import_system(package, path):
             log.warning("%s", note)
-    typer.echo(path)
+    say(path)
 
 
 @app.command()
@@ -413,7 +410,7 @@ def export(
     path = output or system_file.with_suffix(".ssp")
     with interruptible():
         export_system(system_file, path)
-    typer.echo(path)
+    say(path)
 
 
 def _dask_runner(
@@ -442,10 +439,9 @@ def list_(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Show the slaves, agents, runs and routers on the bus."""
-    from rich.console import Console  # noqa: PLC0415
-
     from master_node.listing import listing_data, listing_tables  # noqa: PLC0415
     from master_node.survey import survey  # noqa: PLC0415
+    from protocol.tables import show  # noqa: PLC0415
 
     with _windows(connect, listen, insecure=insecure, tls=tls) as opened:
         for window in opened:
@@ -453,10 +449,9 @@ def list_(
                 log.warning("%s", window.failure)
         participants = survey([window.bus for window in opened if window.bus is not None])
     if as_json:
-        typer.echo(json.dumps(listing_data(participants), indent=2))
+        say_json(listing_data(participants))
         return
-    for table in listing_tables(participants):
-        Console().print(table)
+    show(*listing_tables(participants))
     if not participants:
         log.warning("nobody is on the bus; `master-node doctor` says what to look at")
 
@@ -469,20 +464,17 @@ def doctor(
     tls: Tls = None,
 ) -> None:
     """Look for what would keep a run from working; exit code 1 when there is something."""
-    from rich.console import Console  # noqa: PLC0415
-
     from master_node.doctor import diagnose  # noqa: PLC0415
-    from master_node.plain_text import plain  # noqa: PLC0415
+    from protocol.tables import show  # noqa: PLC0415
 
     with _windows(connect, listen, insecure=insecure, tls=tls) as opened:
         diagnosis = diagnose(opened)
-    for table in diagnosis.tables():
-        Console().print(table)
+    show(*diagnosis.tables())
     for problem in diagnosis.problems:
-        typer.echo(plain(f"{problem.where}: {problem.cause}; {problem.remedy}"))
+        say(f"{problem.where}: {problem.cause}; {problem.remedy}")
     if diagnosis.problems:
         raise typer.Exit(1)
-    typer.echo("no problem found")
+    say("no problem found")
 
 
 @contextmanager
@@ -542,5 +534,5 @@ def main() -> None:
         if logs_json():
             log.error("%s", error, extra=about(error))
         else:
-            typer.echo(f"master-node: {error}", err=True)
+            say_error("master-node", error)
         sys.exit(error.exit_code)

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
-from rich.text import Text
 from scipy.interpolate import PchipInterpolator
 
 from master_node.results import Result
 from protocol.errors import ResultsError
 from protocol.signals import FloatArray
+from protocol.tables import lines, plain
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +102,9 @@ class Comparison:
             if names:
                 remarks.append(f"only in {side}: {', '.join(names)}")
         table = Table(
-            title=Text(f"a = {self.a}\nb = {self.b}"),
+            title=lines((f"a = {self.a}", f"b = {self.b}")),
             title_justify="left",
-            caption=Text("\n".join(remarks)),
+            caption=lines(remarks),
             caption_justify="left",
         )
         table.add_column("variable", overflow="fold")
@@ -114,12 +114,12 @@ class Comparison:
         table.add_column("within")
         for v in self.variables:
             table.add_row(
-                Text(v.name),  # not markup: names may hold brackets
-                Text(v.unit),
+                plain(v.name),
+                plain(v.unit),
                 f"{v.largest_difference:.3e}",
                 f"{v.time:.6g}",
                 f"{v.rms:.3e}",
-                Text("yes", "green") if v.within_tolerance else Text("no", "bold red"),
+                plain("yes", "green") if v.within_tolerance else plain("no", "bold red"),
             )
         return table
 

@@ -6,18 +6,21 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from time import monotonic
 
 from rich.table import Table
 
-from master_node.plain_text import plain
 from master_node.survey import Participant, Timing, measure, survey
 from master_node.windows import Window
 from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
 from protocol.agents import AgentStatus
 from protocol.errors import SlaveLostError, VersionError
 from protocol.keys import AgentKey, MasterKey, SlaveKey
+from protocol.tables import plain
 
 _ROUNDS = 20
+_TIME_OF_ONE = 3.0
+_TIME = 20.0
 _CLOCK_DIFFERENCE = 5.0
 
 
@@ -55,7 +58,9 @@ class Diagnosis:
         for window in self.windows:
             result = "listening" if window.listens else "connected"
             failure = window.failure
-            ways.add_row(window.endpoint, plain(result if failure is None else failure.cause))
+            ways.add_row(
+                plain(window.endpoint), plain(result if failure is None else failure.cause)
+            )
         there = Table(title="Participants", title_justify="left")
         for column in ("name", "host / pid", "answers", "round trip", "clock", "state"):
             there.add_column(column, overflow="fold")
@@ -64,7 +69,7 @@ class Diagnosis:
             there.add_row(
                 plain(described(participant)),
                 plain("-" if status is None else f"{status.host} / {status.pid}"),
-                f"{len(timing.round_trips)} of {_ROUNDS}",
+                f"{len(timing.round_trips)} of {timing.asked}",
                 _milliseconds(timing.median),
                 _milliseconds(timing.clock_difference, signed=True),
                 plain(_state(participant)),
@@ -80,8 +85,14 @@ def diagnose(windows: Sequence[Window]) -> Diagnosis:
         if window.failure is not None
     ]
     participants = survey([window.bus for window in windows if window.bus is not None])
+    end = monotonic() + _TIME
     timings = [
-        (p, measure(p, _ROUNDS) if p.status is not None else Timing((), math.nan))
+        (
+            p,
+            measure(
+                p, _ROUNDS if p.status is not None else 0, min(_TIME_OF_ONE, end - monotonic())
+            ),
+        )
         for p in participants
     ]
     for participant, timing in timings:
@@ -124,11 +135,11 @@ def _problems_of(participant: Participant, timing: Timing) -> list[Problem]:
     if failure is not None:
         return [Problem(where, f"no usable answer: {failure.cause}", "see its log, or restart it")]
     problems = []
-    if len(timing.round_trips) < _ROUNDS:
-        lost = _ROUNDS - len(timing.round_trips)
-        problems.append(
-            Problem(where, f"{lost} of {_ROUNDS} queries were not answered", "look at the network")
-        )
+    if not timing.asked:
+        problems.append(Problem(where, "there was no time left to ask it", "ask again for fewer"))
+    elif lost := timing.asked - len(timing.round_trips):
+        cause = f"{lost} of {timing.asked} queries were not answered"
+        problems.append(Problem(where, cause, "look at the network"))
     if timing.round_trips and not abs(timing.clock_difference) <= _CLOCK_DIFFERENCE:
         problems.append(
             Problem(

@@ -8,11 +8,13 @@ from datetime import datetime
 
 from rich.table import Column, Table
 
-from master_node.plain_text import plain
 from master_node.survey import Participant
 from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
 from protocol.agents import AgentStatus
 from protocol.keys import AgentKey, MasterKey, SlaveKey
+from protocol.tables import plain
+
+_SHOWN_SILENT = 20
 
 
 def listing_tables(participants: Sequence[Participant]) -> list[Table]:
@@ -23,6 +25,7 @@ def listing_tables(participants: Sequence[Participant]) -> list[Table]:
     runs = _table("Runs", "run", "host", "system", "slaves", "since")
     routers = _table("Routers", "host", "addresses", "since")
     silent = _table("No answer", "key", "cause")
+    silences = 0
     for participant in participants:
         match participant.status:
             case SlaveStatus() as s:
@@ -37,7 +40,11 @@ def listing_tables(participants: Sequence[Participant]) -> list[Table]:
             case RouterStatus() as r:
                 _add(routers, f"{r.host} / {r.pid}", r.endpoints, _clock(r.since))
             case None:
-                _add(silent, participant.key.alive, participant.failure)
+                silences += 1
+                if silences <= _SHOWN_SILENT:
+                    _add(silent, participant.key.alive, participant.failure)
+    if silences > _SHOWN_SILENT:
+        _add(silent, f"and {silences - _SHOWN_SILENT} more", "--json shows all")
     return [table for table in (slaves, agents, runs, routers, silent) if table.row_count]
 
 

@@ -17,11 +17,12 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 from rich.table import Column, Table
-from rich.text import Text
 
 from master_node.agent_models import Sent
 from master_node.numerics.extrapolation import InputPolynomial
 from master_node.observers import Attempt, RunEnd, RunStart, SlaveStatistics, slowest
+from protocol.plain_text import printable
+from protocol.tables import StandardError, plain
 
 UPDATE_INTERVAL = 0.1
 """Shortest time between two redraws [s]."""
@@ -40,7 +41,7 @@ class ProgressBar:
 
     def __init__(self, quiet: bool = False, console: Console | None = None) -> None:
         self._quiet = quiet
-        self._console = StandardError(stderr=True) if console is None else console
+        self._console = StandardError() if console is None else console
         self._progress: Progress | None = None
         self._task = TaskID(0)
         self._start_time = 0.0
@@ -114,7 +115,7 @@ class ProgressBar:
         progress.refresh()
 
     def _line(self, text: str) -> None:
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(plain(text), highlight=False, soft_wrap=True)
 
 
 def _slowest(statistics: Mapping[str, SlaveStatistics], wall_time: float, label: str) -> str:
@@ -136,7 +137,7 @@ class UploadBar:
     """
 
     def __init__(self, quiet: bool = False, console: Console | None = None) -> None:
-        self._console = StandardError(stderr=True) if console is None else console
+        self._console = StandardError() if console is None else console
         self._quiet = quiet or not self._console.is_terminal
         self._progress: Progress | None = None
         self._task = TaskID(0)
@@ -154,7 +155,8 @@ class UploadBar:
                 console=self._console,
                 auto_refresh=False,
             )
-            self._task = self._progress.add_task(f"{sent.model} to {sent.agent}", total=sent.size)
+            what = printable(f"{sent.model} to {sent.agent}")
+            self._task = self._progress.add_task(what, total=sent.size)
             self._progress.start()
         self._progress.update(self._task, completed=sent.sent)
         self._progress.refresh()
@@ -171,14 +173,6 @@ class UploadBar:
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
-
-
-class StandardError(Console):
-    """Rich ends the program when its pipe breaks; a run must not end because nobody looks."""
-
-    def on_broken_pipe(self) -> None:
-        """Be silent from now on."""
-        self.quiet = True
 
 
 _FACTS = (
@@ -215,9 +209,9 @@ def summary_table(result_summary: Mapping[str, Any]) -> Table:
         value = result_summary.get(key)
         if value not in (None, ""):
             style = _outcome_style(value) if key == "outcome" else ""
-            facts.add_row(label, Text(_text(value) + unit, style))
+            facts.add_row(label, plain(_text(value) + unit, style))
     for label, text in _control(result_summary):
-        facts.add_row(label, Text(text))
+        facts.add_row(label, plain(text))
     parts: list[RenderableType] = [facts]
     per_slave = [(result_summary.get(key) or {}, label) for key, label in _PER_SLAVE]
     names = dict.fromkeys(name for values, _ in per_slave for name in values)
@@ -225,9 +219,9 @@ def summary_table(result_summary: Mapping[str, Any]) -> Table:
         first = Column("slave", overflow="fold")
         slaves = Table(first, box=None, padding=(0, 2, 0, 0), header_style="dim")
         for _, label in per_slave:
-            slaves.add_column(Text(label), justify="right")
+            slaves.add_column(plain(label), justify="right")
         for name in names:
-            slaves.add_row(Text(name), *(_text(values.get(name, "")) for values, _ in per_slave))
+            slaves.add_row(plain(name), *(plain(_text(v.get(name, ""))) for v, _ in per_slave))
         parts += ["", slaves]
     table = Table.grid()
     for part in parts:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass, fields
 
 from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
 from protocol.agents import AgentStatus
 from protocol.bus import Bus, Caller
 from protocol.codec import decode_map, decode_record
-from protocol.errors import DeadlineError, DoublestepError, SlaveLostError
+from protocol.errors import DoublestepError, MalformedMessageError
 from protocol.keys import (
     STATUS,
     AgentKey,
@@ -23,6 +24,12 @@ from protocol.keys import (
     alive_slaves,
 )
 
+log = logging.getLogger("master_node")
+
+SURVEY_TIME = 10.0
+"""Bound on a survey [s]: one participant can put up thousands of tokens. The rest is not asked."""
+
+_AT_ONCE = 64
 _TOKEN_TIME = 1.0
 _STATUS_TIME = 1.0
 
@@ -48,21 +55,29 @@ class Participant:
 
 
 def survey(buses: Sequence[Bus]) -> list[Participant]:
-    """All slaves, agents, masters and routers in sight, each once, sorted; asked at once."""
+    """All slaves, agents, masters and routers in sight, each once, sorted; in a bounded time."""
     found: dict[Key, Bus] = {}
     for bus in buses:
         for key in _tokens(bus):
             found.setdefault(key, bus)
-    asked = []
-    for key, bus in sorted(found.items(), key=lambda item: _place(item[0])):
-        asked.append((key, bus, _caller(bus, key).send(b"")))
-    participants = []
-    for key, bus, pending in asked:
-        try:
-            participants.append(Participant(key, bus, _status(key, pending.result())))
-        except DoublestepError as error:
-            participants.append(Participant(key, bus, failure=error))
+    known = sorted(found.items(), key=lambda item: _place(item[0]))
+    end = time.monotonic() + SURVEY_TIME
+    participants: list[Participant] = []
+    while len(participants) < len(known) and time.monotonic() < end:
+        participants += _asked(known[len(participants) :][:_AT_ONCE])
+    if left := len(known) - len(participants):
+        log.warning("%d more participants, which there was no time to ask", left)
     return participants
+
+
+def _asked(group: Sequence[tuple[Key, Bus]]) -> Iterator[Participant]:
+    """Ask some at once: their answers are held until the last one has come."""
+    pending = [(key, bus, _caller(bus, key).send(b"")) for key, bus in group]
+    for key, bus, reply in pending:
+        try:
+            yield Participant(key, bus, _status(key, reply.result()))
+        except DoublestepError as error:
+            yield Participant(key, bus, failure=error)
 
 
 @dataclass(frozen=True)
@@ -70,11 +85,13 @@ class Timing:
     """Of status queries.
 
     Attributes:
+        asked: how many there were.
         round_trips: [s], in order; empty when none was answered.
         clock_difference: how far the other clock is ahead of ours [s], NaN when not known; good to
             half the shortest round trip.
     """
 
+    asked: int
     round_trips: tuple[float, ...]
     clock_difference: float
 
@@ -86,21 +103,23 @@ class Timing:
         return sorted(self.round_trips)[len(self.round_trips) // 2]
 
 
-def measure(participant: Participant, rounds: int) -> Timing:
-    """Ask for the status ``rounds`` times; a query that is not answered is left out."""
+def measure(participant: Participant, rounds: int, timeout: float) -> Timing:
+    """Ask for the status ``rounds`` times, and no longer than ``timeout`` seconds."""
     caller = _caller(participant.bus, participant.key)
     times, shortest, difference = [], float("inf"), float("nan")
-    for _ in range(rounds):
+    end, asked = time.monotonic() + timeout, 0
+    while asked < rounds and time.monotonic() < end:
+        asked += 1
         sent, begin = time.time(), time.perf_counter()
         try:
             status = _status(participant.key, caller.request(b""))
-        except (SlaveLostError, DeadlineError):
+        except DoublestepError:
             continue
         taken = time.perf_counter() - begin
         times.append(taken)
         if taken < shortest:
             shortest, difference = taken, status.time - (sent + taken / 2)
-    return Timing(tuple(times), difference)
+    return Timing(asked, tuple(times), difference)
 
 
 def _tokens(bus: Bus) -> list[Key]:
@@ -128,6 +147,20 @@ def _caller(bus: Bus, key: Key) -> Caller:
 
 
 def _status(key: Key, data: bytes) -> Status:
+    """The status that a participant tells.
+
+    Raises:
+        MalformedMessageError: it is no status, or that of another.
+        DoublestepError: the error that the participant answers.
+    """
+    status = _decoded(key, data)
+    told = tuple(getattr(status, field.name) for field in fields(key))
+    if told != astuple(key):
+        raise MalformedMessageError(f"it says that it is {'/'.join(map(str, told))}")
+    return status
+
+
+def _decoded(key: Key, data: bytes) -> Status:
     if isinstance(key, AgentKey):
         return decode_record(AgentStatus, data)
     message = decode_map(data)

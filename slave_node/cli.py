@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import os
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from protocol.administration import STATUS_BYTES
 from protocol.bus import DEFAULT_ENDPOINT
 from protocol.credentials import Credentials, Role
 from protocol.endpoints import LOOPBACK, Endpoints, Mode
@@ -32,6 +32,7 @@ from protocol.processes import ending_signals
 from protocol.scratch import ScratchDirectory
 from protocol.slave import StartValue
 from protocol.standard_output import guarded_standard_output, output_of_others
+from protocol.terminal import say, say_error, say_json
 from protocol.threads import start_thread
 from protocol.toml_text import toml_value
 
@@ -253,7 +254,7 @@ def check(  # noqa: PLR0917  options of the command line
     if name:
         check_name(name)
     with interruptible():
-        bus = ZenohBus(endpoints, timeout=timeout)
+        bus = ZenohBus(endpoints, timeout=timeout, largest=STATUS_BYTES)
         try:
             check_alive(bus, name, agent=agent)
         finally:
@@ -311,7 +312,9 @@ def agent(  # noqa: PLR0917  options of the command line
     log_format: LogStyle = LogFormat.TEXT,
 ) -> None:
     """Start slaves on this host when masters ask for them, until SIGTERM or Ctrl-C."""
-    from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  each command imports what it needs
+    from protocol.agents import AGENT_MESSAGE_BYTES  # noqa: PLC0415  each command imports its own
+    from protocol.codec import MAX_MESSAGE_BYTES  # noqa: PLC0415
+    from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415
     from slave_node.agent import Agent, Offer, Surroundings  # noqa: PLC0415
     from slave_node.agent_options import (  # noqa: PLC0415
         default_cache,
@@ -346,7 +349,9 @@ def agent(  # noqa: PLR0917  options of the command line
     with ExitStack() as stack:
         scratch = stack.enter_context(ScratchDirectory())
         try:
-            bus = ZenohBus(places.own, stop=ending)
+            is_passing_on = bool(places.own.listen)  # what masters and slaves say to each other
+            largest = MAX_MESSAGE_BYTES if is_passing_on else AGENT_MESSAGE_BYTES
+            bus = ZenohBus(places.own, stop=ending, largest=largest)
             stack.callback(bus.close)
             log.info("on the bus %s", _where(places.own))
             surroundings = Surroundings(places.of_slaves, scratch, logs)
@@ -382,7 +387,7 @@ def certificates(
     hosts = [Host.parse(text) for text in host]
     with interruptible():
         for path in make_certificates(directory, hosts, role or [Role.SLAVE], days):
-            typer.echo(path)
+            say(path)
 
 
 @app.command()
@@ -397,13 +402,11 @@ def inspect(
     with interruptible(), output_of_others():
         description = describe_model(model, Path.cwd())
     if as_json:
-        typer.echo(json.dumps(_finite(asdict(description)), indent=2))
+        say_json(_finite(asdict(description)))
         return
-    from rich.console import Console  # noqa: PLC0415
+    from protocol.tables import show  # noqa: PLC0415
 
-    console = Console()
-    for table in description_tables(description):
-        console.print(table)
+    show(*description_tables(description))
 
 
 @app.command()
@@ -423,15 +426,16 @@ def validate(
     if as_json:
         with interruptible(), output_of_others():
             findings = list(trials(model, Path.cwd(), step_size, timeout=timeout))
-        typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
+        say_json([asdict(finding) for finding in findings])
     else:
         from rich.console import Console  # noqa: PLC0415
 
+        from protocol.tables import show  # noqa: PLC0415
         from slave_node.inspection import report_table  # noqa: PLC0415
 
         with interruptible(), Console(stderr=True).status("trying"), output_of_others():
             findings = list(trials(model, Path.cwd(), step_size, timeout=timeout))
-        Console().print(report_table(model, findings))
+        show(report_table(model, findings))
     if not is_usable(findings):
         raise unusable(model)
 
@@ -521,5 +525,5 @@ def main() -> None:
         if logs_json():
             log.error("%s", error, extra=about(error))
         else:
-            typer.echo(f"slave-node: {error}", err=True)
+            say_error("slave-node", error)
         sys.exit(error.exit_code)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Column, Table
-from rich.text import Text
 
 from protocol.slave import SlaveDescription
+from protocol.tables import plain
 from slave_node.validation import Finding, Grade
 
 _STATE = {
@@ -35,12 +35,12 @@ def description_tables(description: SlaveDescription) -> list[Table]:
 
 def report_table(model: str, findings: Sequence[Finding]) -> Table:
     """The report of ``slave-node validate``."""
-    table = Table(title=Text(model), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(title=plain(model), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("tried", "", "result", "so"):
         table.add_column(column, overflow="fold")
     for finding in findings:
-        grade = Text(finding.grade, _STYLES[finding.grade])
-        table.add_row(finding.what, grade, Text(finding.result), Text(finding.consequence))
+        grade = plain(finding.grade, _STYLES[finding.grade])
+        table.add_row(plain(finding.what), grade, plain(finding.result), plain(finding.consequence))
     return table
 
 
@@ -49,7 +49,7 @@ _STYLES = {Grade.OK: "green", Grade.NOTE: "yellow", Grade.PROBLEM: "bold red"}
 
 def _model(description: SlaveDescription) -> Table:
     columns = (Column(overflow="fold"), Column(overflow="fold"))
-    table = Table(*columns, title=Text(description.model), show_header=False, title_justify="left")
+    table = Table(*columns, title=plain(description.model), show_header=False, title_justify="left")
     can = description.capabilities
     rows = {
         "kind": description.kind,
@@ -74,7 +74,7 @@ def _model(description: SlaveDescription) -> Table:
     if description.remarks:
         rows["remarks"] = "; ".join(description.remarks)
     for name, value in rows.items():
-        table.add_row(name, Text(value or "-"))
+        table.add_row(name, plain(value or "-"))
     return table
 
 
@@ -102,7 +102,7 @@ def _variables(description: SlaveDescription) -> Table:
             "" if v.nominal == 1.0 else str(v.nominal),
             v.description,
         )
-        table.add_row(*map(Text, cells))  # brackets of a model are no markup
+        table.add_row(*map(plain, cells))
     return table
 
 

@@ -17,9 +17,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from master_node.progress import UPDATE_INTERVAL, StandardError
+from master_node.progress import UPDATE_INTERVAL
 from master_node.study.directory import run_name
 from master_node.study.records import RunRecord
+from protocol.tables import StandardError, plain
 
 
 class StudyProgress:
@@ -35,7 +36,7 @@ class StudyProgress:
 
     def __init__(self, quiet: bool = False, console: Console | None = None) -> None:
         self._quiet = quiet
-        self._console = StandardError(stderr=True) if console is None else console
+        self._console = StandardError() if console is None else console
         self._progress: Progress | None = None
         self._task = TaskID(0)
         self._runs = self._ended = self._failed = 0
@@ -104,4 +105,4 @@ class StudyProgress:
 
     def _line(self, text: str) -> None:
         if not self._quiet:
-            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+            self._console.print(plain(text), highlight=False, soft_wrap=True)

@@ -154,7 +154,7 @@ class RunProcess:
     def _last_words(self) -> str:
         with suppress(OSError):
             text = (self._part / LOG_FILE).read_text(encoding="utf-8", errors="replace").strip()
-            _, prefix, words = text.rpartition(_PREFIX)
+            _, prefix, words = f"\n{text}".rpartition(f"\n{_PREFIX}")
             return (words if prefix else text.rpartition("\n")[2])[-_MESSAGE_LENGTH:]
         return ""
 
