@@ -3,6 +3,7 @@
 import sys
 
 from benchmarks import (
+    attacks,
     coverage_guided,
     emulated_inputs,
     fault_points,
@@ -61,6 +62,7 @@ TABLES = {
 }
 
 CHECKS = {
+    "attacks": attacks.main,
     "coverage_guided": coverage_guided.main,
     "fault_points": fault_points.main,
     "fault_schedules": fault_schedules.main,

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from struct import Struct
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 from zlib import crc32
 
 from master_node.call_log import CallLog, LoggedStep, SavedState
@@ -32,6 +31,8 @@ from master_node.results.files import (
 )
 from protocol.archives import UNREADABLE, bounded_archive, read_entry
 from protocol.errors import DoublestepError, ResultsError
+from protocol.keys import is_name
+from protocol.new_files import open_new, open_old, remove_folder
 
 _SYSTEM_FILE = "system.json"
 _RUN_FILE = "run.zip"
@@ -92,6 +93,13 @@ class _CallsFile:
     size: int = 0
     checksum: int = 0
 
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Self:
+        """The file that a header describes; raises TypeError where the header is wrong."""
+        if not all(type(value) is int and value >= 0 for value in told.values()):
+            raise TypeError(f"{told} are not numbers")
+        return cls(**told)
+
 
 @dataclass
 class CheckpointStore:
@@ -109,6 +117,11 @@ class CheckpointStore:
     @property
     def _folder(self) -> Path:
         return self.directory / CHECKPOINT_FOLDER
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All that says what is run and where it stood."""
+        return self._folder, self._folder / _SYSTEM_FILE, self._folder / _RUN_FILE
 
     def begin(self) -> None:
         """Replace the checkpoint of an earlier run.
@@ -130,7 +143,7 @@ class CheckpointStore:
 
     def remove(self) -> None:
         """The run needs no checkpoint any more."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        remove_folder(self._folder)
 
     def write(self, checkpoint: Checkpoint) -> None:
         """Put a checkpoint in the place of the last one, as a whole or not at all.
@@ -163,7 +176,7 @@ class CheckpointStore:
                         archive.writestr(f"{name}.state", slave.state.data)
             synchronize_folder(self._folder)
         except OSError as error:
-            raise cannot_write(path, error) from error
+            raise cannot_write(Path(error.filename or path), error) from error
         self._remove_old(calls)
         self._calls = calls
 
@@ -174,6 +187,8 @@ class CheckpointStore:
             ResultsError: no run began to step here, or a file cannot be read.
         """
         path = self._folder / _SYSTEM_FILE
+        if self._folder.is_symlink():
+            raise malformed(self._folder, "it is a link, which is not followed")
         try:
             system = json.loads(path.read_bytes())
             path = self._folder / _RUN_FILE
@@ -185,11 +200,13 @@ class CheckpointStore:
                     raise malformed(path, f"version {header['version']} instead of {_VERSION}")
                 slaves = {}
                 for name, told in header["slaves"].items():
+                    if not is_name(name):
+                        raise malformed(path, f"{name!r:.200} is not the name of a slave")
                     number = told.pop("state")
                     state = None
                     if number is not None:
                         state = SavedState(read_entry(archive, f"{name}.state", _LARGEST), number)
-                    self._calls[name] = calls = _CallsFile(**told)
+                    self._calls[name] = calls = _CallsFile.of(told)
                     log = CallLog()
                     log.resume(state, calls.first, list(self._read(name, calls)))
                     slaves[name] = SavedSlave(state, calls.first, log)
@@ -214,7 +231,8 @@ class CheckpointStore:
         calls = _CallsFile(slave.first)
         if old is not None and old.first == slave.first:
             calls = _CallsFile(**vars(old))
-        with self._path(name, calls).open("r+b" if calls.size else "wb") as file:
+        path = self._path(name, calls)
+        with open_old(path) if calls.size else open_new(path) as file:
             file.truncate(calls.size)
             file.seek(calls.size)
             for step in slave.log.steps(calls.first + calls.steps, number):
@@ -231,7 +249,7 @@ class CheckpointStore:
     def _read(self, name: str, calls: _CallsFile) -> Iterator[LoggedStep]:
         path = self._path(name, calls)
         with path.open("rb") as file:
-            data = file.read(calls.size)
+            data = file.read(min(calls.size, path.stat().st_size))
         if len(data) != calls.size or crc32(data) != calls.checksum:
             raise malformed(path, "damaged")
         at = 0

@@ -59,6 +59,9 @@ MetricsPort = Annotated[
     int | None, typer.Option(min=0, max=65535, help="Serve metrics for Prometheus there.")
 ]
 MetricsHost = Annotated[str, typer.Option(help="Address for that; nobody is asked who he is.")]
+PackageBus = Annotated[
+    bool, typer.Option("--package-bus", help="Take [bus] from a package, addresses included.")
+]
 LogStyle = Annotated[LogFormat, typer.Option(help="Of messages on standard error.")]
 ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
 Results = Annotated[
@@ -139,6 +142,7 @@ def run(  # noqa: PLR0917  options of the command line
     mode: Annotated[
         str | None, typer.Option(help="peer: reach slaves directly; client: through a router.")
     ] = None,
+    package_bus: PackageBus = False,
     timeout: Annotated[
         float | None, typer.Option(help="How long to wait for slaves to appear [s].")
     ] = None,
@@ -184,7 +188,7 @@ def run(  # noqa: PLR0917  options of the command line
         from master_node.study.case import apply_case, read_case  # noqa: PLC0415
         from master_node.system_files import open_system  # noqa: PLC0415
 
-        opened = stack.enter_context(open_system(system_file))
+        opened = stack.enter_context(open_system(system_file, package_bus=package_bus))
         system = (
             (opened if case is None else apply_case(opened, read_case(case)))
             .with_simulation(
@@ -254,7 +258,7 @@ def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
     if not no_plot:
         from master_node.plots import plot_result  # noqa: PLC0415  a second for matplotlib
 
-        plot_result(result, directory / PLOT_FILE, show=False, variables=None)
+        plot_result(result, directory / PLOT_FILE, show=False, variables=None, is_named=False)
     if not quiet:
         show(summary_table(result.summary))
         say(f"results in {directory}")
@@ -263,16 +267,22 @@ def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
 @app.command()
 def resume(
     directory: ResultDirectory,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Run what a checkpoint names that is not your own.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
 ) -> None:
-    """Go on with the run in DIRECTORY that was interrupted or killed, with the settings it had."""
+    """Go on with the run in DIRECTORY that was interrupted or killed, with the settings it had.
+
+    It runs the models and functions that the checkpoint in DIRECTORY names.
+    """
     with interruptible():
         from master_node.progress import ProgressBar  # noqa: PLC0415
         from master_node.simulation import resume as resume_run  # noqa: PLC0415
 
         with output_of_others():
-            resume_run(directory, observers=(ProgressBar(quiet=quiet),))
+            resume_run(directory, observers=(ProgressBar(quiet=quiet),), trust=trust)
         _show(directory, quiet=quiet, no_plot=no_plot)
 
 
@@ -350,7 +360,8 @@ def plot(
     path = file or directory / PLOT_FILE
     try:
         with interruptible():
-            plot_result(Result.load(directory), path, show=show, variables=variable or None)
+            result, is_named = Result.load(directory), file is not None
+            plot_result(result, path, show=show, variables=variable or None, is_named=is_named)
     except KeyError as error:
         raise ConfigurationError(f"{directory}: {error.args[0]}", phase="plot") from None
     say(path)
@@ -384,13 +395,14 @@ def import_(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="System file [default: SYSTEM.toml].")
     ] = None,
+    package_bus: PackageBus = False,
 ) -> None:
     """Write an SSP as SYSTEM.toml, with its FMUs in a folder SYSTEM_models beside it."""
     from master_node.system_files import import_system  # noqa: PLC0415
 
     path = output or package.with_name(f"{package.stem.replace('.ssp#', '_')}.toml")
     with interruptible():
-        for note in import_system(package, path):
+        for note in import_system(package, path, package_bus=package_bus):
             log.warning("%s", note)
     say(path)
 

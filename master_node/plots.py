@@ -13,7 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from master_node.results.files import replacing
 from protocol.errors import ResultsError
+from protocol.plain_text import printable
 from protocol.signals import FloatArray
 
 if TYPE_CHECKING:
@@ -35,7 +37,12 @@ _REJECTED = "#d1242f"
 
 
 def plot_result(
-    result: Result, path: Path | None, show: bool, variables: Sequence[str] | None
+    result: Result,
+    path: Path | None,
+    show: bool,
+    variables: Sequence[str] | None,
+    *,
+    is_named: bool = True,
 ) -> Figure:
     """Draw a result.
 
@@ -48,6 +55,8 @@ def plot_result(
         path: file to write, its suffix is the format; None writes none.
         show: open a window (this alone uses ``matplotlib.pyplot``).
         variables: names to draw; None draws all, as far as there is room for them.
+        is_named: the user has named the file, be it a link or a device. Else it is the one of the
+            results directory, and takes the place of what is there.
 
     Raises:
         KeyError: no such variable, or one that holds no numbers.
@@ -56,7 +65,12 @@ def plot_result(
     with matplotlib.rc_context():
         if _is_set_by_working_directory():
             matplotlib.rcdefaults()
-        return _plot(result, path, show, variables)
+        figure = _draw(result, show, variables)
+        if path is not None:
+            _save(figure, path, is_named=is_named)
+        if show:
+            _show()
+        return figure
 
 
 def _is_set_by_working_directory() -> bool:
@@ -64,7 +78,7 @@ def _is_set_by_working_directory() -> bool:
     return Path(matplotlib.matplotlib_fname()).resolve().parent == Path.cwd()
 
 
-def _plot(result: Result, path: Path | None, show: bool, variables: Sequence[str] | None) -> Figure:
+def _draw(result: Result, show: bool, variables: Sequence[str] | None) -> Figure:
     panels = _panels(result, _drawable(result) if variables is None else variables)
     shown = panels[:_OUTPUT_PANELS] if variables is None else panels
     steps = result.steps
@@ -88,10 +102,6 @@ def _plot(result: Result, path: Path | None, show: bool, variables: Sequence[str
     if len(result.time) > 1:
         axes[-1].set_xlim(result.time[0], result.time[-1])
     figure.align_ylabels()
-    if path is not None:
-        _save(figure, path)
-    if show:
-        _show()
     return figure
 
 
@@ -140,7 +150,7 @@ def _panels(result: Result, names: Sequence[str]) -> list[list[str]]:
 def _title(result: Result, variables: int, shown: int) -> str:
     rejected = int(np.count_nonzero(~result.steps["accepted"]))
     parts = [
-        str(result.summary.get("outcome", "run without an end")),
+        _shortened(str(result.summary.get("outcome", "run without an end"))),
         f"{len(result.time)} result points",
         f"{rejected} of {len(result.steps)} attempts rejected",
     ]
@@ -165,9 +175,13 @@ def _show() -> None:
     pyplot.show()
 
 
-def _save(figure: Figure, path: Path) -> None:
+def _save(figure: Figure, path: Path, *, is_named: bool) -> None:
     try:
-        figure.savefig(path, dpi=DOTS_PER_INCH)
+        if is_named:
+            figure.savefig(path, dpi=DOTS_PER_INCH)
+        else:
+            with replacing(path) as file:
+                figure.savefig(file, dpi=DOTS_PER_INCH, format=path.suffix[1:])
     except (OSError, ValueError) as error:  # ValueError: no such format
         reason = (error.strerror if isinstance(error, OSError) else None) or error
         raise ResultsError(
@@ -292,5 +306,6 @@ def _dress(axes: Axes) -> None:
 
 def _shortened(name: str) -> str:
     """At most 40 characters of it, as the names of large models leave no room for the lines."""
+    name = printable(name)
     name = name if len(name) <= 40 else f"{name[:18]} ... {name[-17:]}"
     return name.replace("$", r"\$")  # no formula

@@ -70,6 +70,13 @@ def reopened(saved: Mapping[str, Any]) -> Iterator[tuple[System, RunMode]]:
         raise ResultsError(f"the checkpoint is malformed: {error!r}") from error
 
 
+def programs(system: System) -> list[str]:
+    """The models and functions that a system runs, with the slaves and inputs that they are for."""
+    models = [f"{name}: {s.model}" for name, s in system.slaves.items() if s.model is not None]
+    settings = {n: v for n, v in system.inputs.items() if isinstance(v, InputSettings)}
+    return models + [f"{n}: {v.function}" for n, v in settings.items() if v.function is not None]
+
+
 def check_models(saved: Mapping[str, Any], descriptions: Mapping[str, SlaveDescription]) -> None:
     """Refuse models that are not those with which the run began.
 

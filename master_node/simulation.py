@@ -34,7 +34,15 @@ from master_node.results import (
     finish,
     is_complete,
 )
-from master_node.resumption import RunMode, can_be_saved, check_models, reopened, saved_system
+from master_node.results.files import cannot_write
+from master_node.resumption import (
+    RunMode,
+    can_be_saved,
+    check_models,
+    programs,
+    reopened,
+    saved_system,
+)
 from master_node.shared_process import Baseline, SharedProcess, shared_process
 from master_node.slave_group import SlaveGroup
 from master_node.slave_link import SlaveLink
@@ -42,7 +50,10 @@ from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
 from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.system import resolve
 from master_node.trace import TraceWriter
+from master_node.trust import check_own
 from protocol.errors import InterruptedRunError
+from protocol.names import some
+from protocol.new_files import own_folder
 from protocol.scratch import ScratchDirectory
 from protocol.slave import SlaveDescription
 
@@ -124,7 +135,9 @@ def run(
     )
 
 
-def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None:
+def resume(
+    directory: Path | str, *, observers: Sequence[Observer] = (), trust: bool = False
+) -> None:
     """Go on with a run whose master was interrupted or killed, or that failed.
 
     Its results continue those in the directory, and end up the same, bit for bit, as if nothing
@@ -134,11 +147,13 @@ def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None
     Args:
         directory: with the results and the checkpoint of the run.
         observers: are told of everything that happens from there on.
+        trust: run what the checkpoint names, whoever has written it.
 
     Raises:
         ResultsError: there is nothing to go on with, a file cannot be read, or another run writes
             there.
-        ConfigurationError: a model or a table is not the one with which the run began.
+        ConfigurationError: a model or a table is not the one with which the run began; or the
+            checkpoint is not the user's own.
         DoublestepError: as `simulate`.
     """
     directory = Path(directory).absolute()
@@ -157,7 +172,10 @@ def resume(directory: Path | str, *, observers: Sequence[Observer] = ()) -> None
             resumption = Resumption(saved, CheckpointStore(directory, saved), None)
         else:
             resumption = Resumption(saved, store, Resumed.of(checkpoint))
+        if not trust:
+            check_own((directory, *store.files))
         with reopened(saved) as (system, mode):
+            log.info("the checkpoint names what is run: %s", some(programs(system)))
             _run(system, directory, mode, observers, resumption=resumption)
 
 
@@ -329,10 +347,17 @@ def _slaves(
             yield slaves
         return
     with ScratchDirectory() as temporary:
-        logs = temporary if directory is None else directory / "logs"
-        logs.mkdir(exist_ok=True)
+        logs = temporary if directory is None else _logs(directory)
         with slaves_on_bus(system, logs, launch=mode.launch, uploading=uploading) as slaves:
             yield slaves
+
+
+def _logs(directory: Path) -> Path:
+    folder = directory / "logs"
+    try:
+        return own_folder(folder)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
 
 
 def settings_of(system: System, descriptions: Mapping[str, SlaveDescription]) -> dict[str, object]:

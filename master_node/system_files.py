@@ -27,6 +27,7 @@ from master_node.ssp.writing import write_package
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.files import as_file, is_fmu
 from protocol.keys import check_name
+from protocol.new_files import open_new, own_folder
 from protocol.scratch import ScratchDirectory
 from protocol.slave import SlaveDescription
 from protocol.toml_text import parse_toml
@@ -50,13 +51,18 @@ class ImportedSystem:
 
 
 @contextmanager
-def open_system(path: Path | str) -> Iterator[System]:
+def open_system(path: Path | str, *, package_bus: bool = False) -> Iterator[System]:
     """The system in a ``.toml``, ``.ssp`` or ``.ssd`` file.
 
     ``package.ssp#Variant.ssd`` is another description of a package than its
     ``SystemStructure.ssd``. The models of a package are extracted into a temporary directory,
     which is removed at the end: run the system within the ``with``. What an SSP file holds that is
     not carried is logged.
+
+    Args:
+        path: the file.
+        package_bus: take ``[bus]`` from the annotation of an SSP file: to whom it connects, where
+            it listens, with which certificates.
 
     Raises:
         ConfigurationError: the file is missing or wrong, or holds what is not supported.
@@ -66,7 +72,7 @@ def open_system(path: Path | str) -> Iterator[System]:
         yield load_system(path)
         return
     with ScratchDirectory() as scratch:
-        imported = read_ssp(path, scratch)
+        imported = read_ssp(path, scratch, package_bus=package_bus)
         for note in imported.notes:
             log.warning("%s", note)
         try:
@@ -95,12 +101,13 @@ def _package(path: Path) -> tuple[Path, str]:
     return path, ""
 
 
-def read_ssp(path: Path, scratch: Path) -> ImportedSystem:
+def read_ssp(path: Path, scratch: Path, *, package_bus: bool = False) -> ImportedSystem:
     """The system in an ``.ssp`` or ``.ssd`` file.
 
     Args:
         path: the file, or ``package.ssp#Variant.ssd``.
         scratch: an existing empty directory, into which packages are extracted.
+        package_bus: as for `open_system`.
 
     Raises:
         ConfigurationError: as `open_system`.
@@ -112,7 +119,7 @@ def read_ssp(path: Path, scratch: Path) -> ImportedSystem:
     describe: Callable[[Path], SlaveDescription] = cache(lambda fmu: load(str(fmu), Path()))
     slaves, connections = flatten(structure.system, describe, notes)
     base = scratch if is_package(path) else path.absolute().parent
-    tables = _settings(structure, path, notes)
+    tables = _settings(structure, path, notes, package_bus=package_bus)
     unknown = sorted(tables["slaves"].keys() - {slave.name for slave in slaves})
     if unknown:
         raise ConfigurationError(f"{path}: the annotation has settings of {unknown[0]!r}, no slave")
@@ -131,11 +138,16 @@ def read_ssp(path: Path, scratch: Path) -> ImportedSystem:
     return ImportedSystem(system, notes.sentences())
 
 
-def import_system(path: Path, output: Path) -> tuple[str, ...]:
+def import_system(path: Path, output: Path, *, package_bus: bool = False) -> tuple[str, ...]:
     """Write an ``.ssp`` or ``.ssd`` file, or a variant of a package, as a TOML file.
 
     FMUs out of packages are copied to a folder beside it, named after it with ``_models``; what
-    is there of these names is overwritten.
+    is there of these names is replaced.
+
+    Args:
+        path: the file.
+        output: the TOML file.
+        package_bus: as for `open_system`.
 
     Returns:
         A sentence for all that is not carried.
@@ -146,7 +158,7 @@ def import_system(path: Path, output: Path) -> tuple[str, ...]:
     _check_suffix(path, *_SSP_SUFFIXES)
     _check_suffix(output, ".toml")
     with ScratchDirectory() as scratch:
-        imported = read_ssp(path, scratch)
+        imported = read_ssp(path, scratch, package_bus=package_bus)
         system = imported.system
         names = _file_names(system)
         tables = _tables(system)
@@ -155,9 +167,13 @@ def import_system(path: Path, output: Path) -> tuple[str, ...]:
             for name in system.slaves:
                 model = system.base / str(system.slaves[name].model)
                 if model.is_relative_to(scratch):
-                    folder.mkdir(parents=True, exist_ok=True)
-                    with as_file(model) as file:
-                        shutil.copyfile(file, folder / names[name])
+                    own_folder(folder)
+                    with (
+                        as_file(model) as file,
+                        file.open("rb") as source,
+                        open_new(folder / names[name]) as target,
+                    ):
+                        shutil.copyfileobj(source, target)
                     model = folder / names[name]
                 relative = os.path.relpath(model, output.parent)
                 tables["slaves"][name]["model"] = Path(relative).as_posix()
@@ -203,7 +219,9 @@ def _places(path: Path, slaves: list[Slave], connections: list[FlatConnection]) 
     )
 
 
-def _settings(structure: Structure, path: Path, notes: Notes) -> dict[str, dict[str, Any]]:
+def _settings(
+    structure: Structure, path: Path, notes: Notes, *, package_bus: bool
+) -> dict[str, dict[str, Any]]:
     """The tables of our own annotation, with the times of the default experiment."""
     where = f"{path}: the annotation of Doublestep"
     try:
@@ -222,6 +240,12 @@ def _settings(structure: Structure, path: Path, notes: Notes) -> dict[str, dict[
             f"{path}: [bus] insecure = true is not taken from a package; say --insecure if you "
             "trust the network"
         )
+    if tables["bus"] and not package_bus:
+        notes.tell(
+            f"{path}: [bus] {', '.join(tables['bus'])} is not taken from a package; say it "
+            "yourself, or say --package-bus if you trust the package with your network"
+        )
+        tables["bus"] = {}
     if structure.start_time is not None:
         tables["simulation"]["start_time"] = structure.start_time
     if structure.stop_time is not None:
@@ -302,6 +326,7 @@ def _replace(output: Path, write: Callable[[Path], object]) -> None:
     """Write a file beside ``output`` and put it in its place when it is whole."""
     part = output.with_name(f".{output.name}.part")
     try:
+        part.unlink(missing_ok=True)  # a link would be followed
         write(part)
         part.replace(output)
     finally:

@@ -9,6 +9,8 @@ import importlib
 import os
 import signal
 
+from protocol.plain_text import printable  # imports nothing itself
+
 TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than all else here
 if TYPE_CHECKING:
     from typing import NoReturn
@@ -39,5 +41,5 @@ def run_command(name: str, module: str) -> None:
 
 def _end(message: str, exit_code: int) -> NoReturn:
     """At once: nothing of the interpreter is to be tidied up."""
-    os.write(2, f"{message}\n".encode(errors="replace"))
+    os.write(2, f"{printable(message)}\n".encode(errors="replace"))
     os._exit(exit_code)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import os
@@ -124,15 +125,28 @@ class _Sink(io.RawIOBase):
 
 
 def entry_names(folder: Path) -> Iterator[str]:
-    """Names of the files in the folder of an FMU, with slashes; raises `OSError`."""
+    """Names of the files in the folder of an FMU, with slashes.
+
+    Raises:
+        OSError: it cannot be read, or holds a link, which could lead to any file, as in an archive.
+    """
 
     def fail(error: OSError) -> None:
         raise error
 
     for entry in FMU_ENTRIES:
         if (folder / entry).is_file():
-            yield entry
+            yield _no_link(folder, entry)
         elif (folder / entry).is_dir():
-            for parent, _, files in os.walk(folder / entry, onerror=fail, followlinks=True):
+            _no_link(folder, entry)
+            for parent, folders, files in os.walk(folder / entry, onerror=fail):
                 relative = Path(parent).relative_to(folder)
-                yield from ((relative / name).as_posix() for name in files)
+                for name in folders:
+                    _no_link(folder, (relative / name).as_posix())
+                yield from (_no_link(folder, (relative / name).as_posix()) for name in files)
+
+
+def _no_link(folder: Path, name: str) -> str:
+    if (folder / name).is_symlink():
+        raise OSError(errno.ELOOP, f"{name} is a symbolic link")
+    return name

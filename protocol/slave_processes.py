@@ -25,6 +25,7 @@ from protocol.errors import (
     SlaveLostError,
 )
 from protocol.keys import SlaveKey
+from protocol.new_files import open_new, open_old
 from protocol.python_processes import python_command
 
 _END_TIME = 2.0
@@ -75,7 +76,7 @@ class SlaveProcess:
         self.key = key
         self.log = log
         try:
-            with log.open("ab" if goes_on else "wb") as file:
+            with open_old(log, to_append=True) if goes_on else open_new(log) as file:
                 self._process = subprocess.Popen(
                     command,
                     stdin=subprocess.PIPE,

@@ -12,6 +12,7 @@ from typing import BinaryIO, Protocol
 
 from master_node.observers import Point
 from protocol.errors import ResultsError
+from protocol.new_files import open_new, open_old
 
 RESULTS_FILE = "results.csv"
 ARROW_FILE = "results.arrow"
@@ -60,6 +61,7 @@ _REMEDIES = {
     errno.EDQUOT: "free space within your quota or choose a results directory elsewhere",
     errno.EEXIST: "a file is in the way; choose another name for the results directory",
     errno.ENOTDIR: "part of the path is a file; choose another results directory",
+    errno.ELOOP: "a link is in the way, which is not followed: remove it",
 }
 
 
@@ -95,7 +97,7 @@ class BatchFile(ABC):
 
     def __init__(self, path: Path, size: int | None = None) -> None:
         self.path = path
-        self._file = path.open("xb" if size is None else "r+b", buffering=0)
+        self._file = path.open("xb", buffering=0) if size is None else open_old(path, buffering=0)
         self._size = size or 0
         if size is not None:
             self._file.truncate(size)
@@ -185,7 +187,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """
     unfinished = path.with_name(_UNFINISHED.format(path.name))
     try:
-        with unfinished.open("wb") as file:
+        with open_new(unfinished) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -236,6 +238,16 @@ def cannot_read(path: Path, error: OSError) -> ResultsError:
         f"cannot read {path}: {error.strerror or error}",
         remedy="name a results directory, or a file .csv, .arrow, .parquet or .mat",
     )
+
+
+def check_is_file(path: Path) -> None:
+    """Refuse a device or a pipe under the name of a file, of which there may be no end.
+
+    Raises:
+        ResultsError: it is one.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise malformed(path, "it is no file")
 
 
 def check_growth(path: Path, cells: int) -> None:

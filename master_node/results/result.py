@@ -16,6 +16,7 @@ from master_node.results.columns import NOTHING_KNOWN, DiscreteArray, Known, Tab
 from master_node.results.csv_file import read_csv
 from master_node.results.files import (
     ARROW_FILE,
+    FILES,
     MAT_FILE,
     PARQUET_FILE,
     RESULTS_FILE,
@@ -23,6 +24,7 @@ from master_node.results.files import (
     STEPS_FILE,
     STREAM_FILE,
     SUMMARY_FILE,
+    check_is_file,
 )
 from master_node.results.steps_file import Steps, read_steps
 from master_node.results.summary import read_json
@@ -154,6 +156,8 @@ class Result:
         if not source.is_dir():
             read = _FILE_READERS.get(source.suffix.lower(), _read_foreign_csv)
             return cls.of(read(source, NOTHING_KNOWN), Steps(), {})
+        for name in FILES:
+            check_is_file(source / name)
         summary = read_json(source / SUMMARY_FILE)
         known = Known.of(summary or read_json(source / START_FILE))
         files = (source / name for name in _PREFERRED)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -45,6 +44,7 @@ from master_node.results.summary import (
     write_json,
 )
 from protocol.errors import ResultsError
+from protocol.new_files import remove_folder
 
 FLUSH_INTERVAL = 0.5
 """Shortest time between two writes [s]: what a killed master loses at most of a fast run."""
@@ -202,7 +202,7 @@ class ResultsWriter:
 
     def _remove_old(self) -> None:
         """All of an earlier run; first where it stood, as that means nothing without the rest."""
-        shutil.rmtree(self._directory / CHECKPOINT_FOLDER, ignore_errors=True)
+        remove_folder(self._directory / CHECKPOINT_FOLDER)
         for name in FILES:
             path = self._directory / name
             try:

@@ -20,11 +20,12 @@ from contextlib import suppress
 from pathlib import Path
 from secrets import token_hex
 from types import TracebackType
-from typing import IO, Self
+from typing import BinaryIO, Self
 
 from master_node.study.plan import Plan, PlannedRun
 from master_node.study.records import RECORD_FILE, RunRecord, read_record
 from protocol.errors import ResultsError
+from protocol.new_files import open_old, own_folder
 
 TABLE_FILE = "study.csv"
 LOCK_FILE = "study.lock"
@@ -47,12 +48,12 @@ class StudyDirectory:
         self.path = path.absolute()
         self.runs = self.path / _RUNS
         self.token = token_hex(8)
-        self._lock: IO[str] | None = None
+        self._lock: BinaryIO | None = None
 
     def __enter__(self) -> Self:
         try:
-            self.runs.mkdir(parents=True, exist_ok=True)
-            self._lock = (self.path / LOCK_FILE).open("a", encoding="ascii")
+            own_folder(self.runs)
+            self._lock = _opened_lock(self.path / LOCK_FILE)
             _lock_alone(self._lock)
             self._write_token(self.token)
             for entry in self.runs.iterdir():
@@ -82,8 +83,8 @@ class StudyDirectory:
     def _write_token(self, token: str) -> None:
         assert self._lock is not None
         self._lock.truncate(0)
-        self._lock.write(token)
-        self._lock.flush()
+        self._lock.seek(0)
+        self._lock.write(token.encode("ascii"))
 
     def release_runs(self) -> None:
         """Let runs on other hosts that still work for this sweep end themselves."""
@@ -160,7 +161,13 @@ def is_wanted(path: Path, token: str) -> bool:
         return False
 
 
-def _lock_alone(file: IO[str]) -> None:
+def _opened_lock(path: Path) -> BinaryIO:
+    with suppress(FileExistsError):
+        path.open("xb").close()
+    return open_old(path, buffering=0)
+
+
+def _lock_alone(file: BinaryIO) -> None:
     """Raises BlockingIOError when another process holds it. Windows has no such lock."""
     if sys.platform == "win32":
         return

@@ -12,6 +12,7 @@ from typing import Any
 from master_node.configuration import Scalar
 from master_node.numerics.reductions import REDUCTIONS
 from master_node.results import Result
+from master_node.results.files import replacing
 from master_node.study.configuration import ReducedOutput
 from master_node.study.directory import run_name
 from master_node.study.plan import Plan, PlannedRun
@@ -83,10 +84,9 @@ class StudyTable:
         rows = csv.writer(text, lineterminator="\n")
         rows.writerow(self.columns)
         rows.writerows(self._rows.values())
-        part = path.with_name(f".{path.name}.part")
         try:
-            part.write_text(text.getvalue(), encoding="utf-8", errors="replace")
-            part.replace(path)
+            with replacing(path) as file:
+                file.write(text.getvalue().encode(errors="replace"))
         except OSError as error:
             raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
 
