@@ -40,6 +40,8 @@ _COUNTERS = (
     "rejected_double_steps",
     "discontinuities",
     "double_steps_at_discontinuities",
+    "double_steps_at_false_alarms",
+    "late_jumps",
     "changes_at_smallest_step_size",
     "steps_above_tolerance",
     "time",

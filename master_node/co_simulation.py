@@ -7,6 +7,7 @@ without an estimator, in ``fixed_run.py``.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -31,11 +32,14 @@ from master_node.numerics.error_estimators import ESTIMATORS
 from master_node.observers import DiscreteType, Observer, Outcome, RunEnd, RunStart, Statistics
 from master_node.outputs import Outputs
 from master_node.run_context import RunContext
+from master_node.run_warnings import warnings_of
 from master_node.slave_group import SlaveGroup
 from master_node.system import CoupledSystem
 from protocol.calls import Terminate
 from protocol.errors import ConfigurationError, InterruptedRunError
 from protocol.slave import VariableType
+
+log = logging.getLogger("master_node")
 
 
 def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
@@ -218,6 +222,8 @@ class CoSimulation:
         finally:
             if not outcome.is_complete:
                 self.checkpoints.broken_off()
+            for warning in warnings_of(statistics):
+                log.warning("%s", warning)
             self.observer.ended(RunEnd(outcome, statistics, message))
         self.checkpoints.remove()
         return statistics

@@ -16,14 +16,7 @@ from master_node.double_step import DoubleStep, DoubleStepper
 from master_node.error_control import ErrorControl, StepError
 from master_node.input_defects import InputDefects
 from master_node.missing_derivatives import MissingDerivatives
-from master_node.numerics.discontinuities import (
-    NO_JUMP,
-    Bracket,
-    Defects,
-    does_not_shrink,
-    has_jumped_unnoticed,
-    step_within,
-)
+from master_node.numerics.discontinuities import Defects, Inputs, Search, SmoothStep
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials, highest
@@ -43,6 +36,7 @@ from master_node.result_points import Reached, ReachedPoint, ResultPoints, count
 from master_node.run_context import RunContext
 from master_node.step_requests import FailedStep
 from master_node.step_size_rules import crossings, step_size_limits
+from master_node.unanswered_inputs import Bound, UnansweredInputs
 from protocol.errors import DeadlineError, DoublestepError, SlaveError, StepSizeError
 from protocol.slave import StepStatus
 
@@ -50,6 +44,11 @@ log = logging.getLogger("master_node")
 
 _INF = float("inf")
 _TRIALS = 5
+_NEAR = 0.1
+"""Part of the next H that the last one is at least, for the points before to be of use."""
+
+_COMPARABLE = 16.0
+"""Factor by which a first H is above the smallest one, so that a smaller one tells a jump."""
 
 
 class Position(NamedTuple):
@@ -61,8 +60,8 @@ class Position(NamedTuple):
         step_size: H that is wanted [s].
         controller: the step size controller's memory.
         order: the order control's memory; holds the input polynomial.
-        bracket: of a jump that is being looked for.
-        smooth: step size and largest defect of the last accepted step.
+        search: what is known of jumps behind T_n.
+        smooth: what the last accepted step says of defects; None: nothing.
         errors_in_a_row: attempts that a slave ended with an error.
         event: where a slave has returned early, and a double step must end [s]; None: nowhere.
         unchanged: up to where discrete outputs are known not to change, and a double step must end
@@ -75,9 +74,9 @@ class Position(NamedTuple):
     outputs: Outputs
     step_size: float
     order: OrderMemory
+    search: Search
     controller: ControllerMemory = NOTHING
-    bracket: Bracket = NO_JUMP
-    smooth: tuple[float, float] | None = None
+    smooth: SmoothStep | None = None
     errors_in_a_row: int = 0
     event: float | None = None
     unchanged: float | None = None
@@ -87,6 +86,24 @@ class Position(NamedTuple):
     def time(self) -> float:
         """T_n [s]."""
         return self.history.times[0]
+
+
+class _Jumps(NamedTuple):
+    """Jumps in a double step, as far as defects tell.
+
+    Attributes:
+        defects: of the double step; None: they are not looked at.
+        inputs: those that jump, shape (n,); None: as above.
+        name: the jump in words; "" if nothing jumps.
+        are_answers: whether they lie at T_n, as slaves answer there to corrected inputs.
+        are_late: whether these inputs had been so wrong that the answers may be due earlier.
+    """
+
+    defects: Defects | None = None
+    inputs: Inputs | None = None
+    name: str = ""
+    are_answers: bool = False
+    are_late: bool = False
 
 
 class ControlledRun:
@@ -125,6 +142,7 @@ class ControlledRun:
         self._defects = InputDefects(coupled, scheme)
         self._missing = MissingDerivatives(coupled, scheme)
         self._loses_events: set[str] = set()
+        self._unanswered = UnansweredInputs(coupled, scheme)
         present, past = EXPONENTS[settings.controller]
         self._controller = StepSizeController(
             settings.alpha,
@@ -173,7 +191,11 @@ class ControlledRun:
             DoublestepError: a slave was lost or failed, or H would have to be too small.
         """
         self._results = ResultPoints(
-            self._settings.output_grid, self._scheme.has_derivative, self._start, outputs
+            self._settings.output_grid,
+            self._coupled,
+            self._scheme.has_derivative,
+            self._start,
+            outputs,
         )
         if self._resumed is None:
             position = self._first_position(outputs)
@@ -212,7 +234,8 @@ class ControlledRun:
         settings, u = self._settings, self._coupled.inputs_of(outputs.y)
         depth = self._depth(settings.polynomial.order + 1)  # inputs without derivatives need all
         history = CouplingHistory.start(self._start, u, depth)
-        position = Position(history, outputs, settings.step_size, self._restarted_order())
+        search = Search.nothing(self._defects.number)
+        position = Position(history, outputs, settings.step_size, self._restarted_order(), search)
         if settings.initial_step_size is None:
             position = self._with_initial_step_size(position, self._limits.largest)
         step_size = self._controller.bounded(position.step_size)
@@ -264,6 +287,7 @@ class ControlledRun:
                         error_norm=error.norm,
                         exponent=self._control.exponent(polynomials),
                     )
+                    step_size = max(step_size, _COMPARABLE * self._limits.smallest)
                     bounded = self._controller.bounded(min(step_size, largest))
                     return position._replace(step_size=bounded)
             trial = 0.1 * times.first
@@ -276,9 +300,8 @@ class ControlledRun:
 
     def _advance(self, position: Position, target: float) -> Position | str:
         """One double step, or the attempt of one, towards ``target`` [s]."""
-        wanted = step_within(
-            position.bracket, position.time, position.step_size, self._limits.smallest
-        )
+        smallest, search = self._limits.smallest, position.search
+        wanted = search.step_size(position.time, position.step_size, smallest)
         for nearer in (position.event, position.unchanged):
             if nearer is not None:
                 target = min(target, nearer)
@@ -289,34 +312,31 @@ class ControlledRun:
         position, polynomials, step = self._attempt(position, times)
         if isinstance(step, FailedStep):
             return self._after_failure(position, step, times, polynomials, target)
+        return self._decide(position, step, target)
+
+    def _decide(self, position: Position, step: DoubleStep, target: float) -> Position:
+        """Accept a double step towards ``target`` [s], or go back and look for what changed."""
         error = self._control.judge(step)
-        event = self._event(position, step)
-        defects, jumps = None, False
-        if self._settings.discontinuities:
-            defects = self._defects.of(step, error.scale, position.history, position.smooth)
-            jumps = (
-                position.bracket.shows_jump(defects)
-                or has_jumped_unnoticed(defects)
-                or does_not_shrink(position.bracket, times.first, defects)
-            )
-            if jumps:
-                event = event or f"{self._defects.name(defects)} jumps"
+        jumps = self._jumps(position, step, error)
+        event = self._event(position, step) or jumps.name
         searched = None
         if self._searches_changes:
             searched = self._search_change(position, step, error, target)
-        if event and self._is_smallest(times, target):
-            self._statistics.changes_at_smallest_step_size += searched is not None
-            return self._accept_jump(position, step, error, event)
-        if searched is not None:
-            name, following = searched
-            self._statistics.double_steps_at_discontinuities += 1
-            self._tell_rejected(times, polynomials, error.norm, f"{name} changes")
-            return following
-        if error.norm <= 1.0 and not jumps:
-            return self._accept(position, step, error, defects)
-        if position.crossings and error.norm < _INF and self._is_smallest(times, target):
-            return self._accept_behind_event(position, step, error, defects)
-        return self._reject(position, step, error, defects, target)
+        if self._is_smallest(step.times, target):
+            if jumps.name and event == jumps.name and jumps.are_answers:
+                return self._leave_to_estimate(position, step, error, jumps)
+            if position.search.is_at_point and not error.norm <= 1.0:
+                event = event or f"{error.limiting_variable} jumps"
+            if event:
+                self._statistics.changes_at_smallest_step_size += searched is not None
+                return self._accept_jump(position, step, error, event)
+        if searched is not None or jumps.name or position.search.looks_at_point:
+            return self._go_on_searching(position, step, error, jumps, searched)
+        if error.norm <= 1.0:
+            return self._accept(position, step, error, jumps.defects)
+        if position.crossings and error.norm < _INF and self._is_smallest(step.times, target):
+            return self._accept_behind_event(position, step, error, jumps.defects)
+        return self._reject(position, step, error, jumps.defects, target)
 
     def _attempt(
         self, position: Position, times: DoubleStepTimes
@@ -375,35 +395,60 @@ class ControlledRun:
         _, following, controller = self._controller.decide(
             times.first, error.norm, self._control.exponent(polynomials), position.controller
         )
-        if self._limits.is_cut_short(times, position.step_size):  # by a target or a bracket
+        is_cut_short = self._limits.is_cut_short(times, position.step_size)
+        if is_cut_short:  # by a target or a bracket
             following = max(following, position.step_size)
-        memory = position.order
-        if self._orders is not None:
-            memory, factor = self._orders.choose(memory, step, error, history)
+        memory, bound = position.order, self._bound(step, error, defects, history)
+        is_searching = position.search.end is not None
+        if self._orders is not None and not (is_searching and is_cut_short):
+            memory, factor = self._orders.choose(memory, step, error, history, bound)
             if factor is not None:
                 factor = min(factor, self._settings.theta_max)
                 if position.controller.rejected:
                     factor = min(factor, 1.0)
                 following = self._controller.bounded(times.first * factor)
                 controller = NOTHING
-        bracket = position.bracket
-        if bracket.end is not None:
+        if bound is not None and memory.polynomial.order:  # constants would ask for any number
+            polynomials = self._available.of(memory.polynomial, history)
+            bounded = min(following, times.first * bound(polynomials))
+            following = self._controller.bounded(bounded)
+        search = position.search.passed(times.end)
+        if is_searching:
             self._statistics.double_steps_at_discontinuities += 1
-            if times.end >= bracket.end:  # a false alarm; points so near say nothing of larger H
-                return Position(
-                    history.cut(), _end(step), position.step_size, self._restarted_order()
-                )
-        smooth = None if defects is None else (times.first, defects.largest)
+            if search.end is None:  # a false alarm
+                self._statistics.double_steps_at_false_alarms += position.search.attempts + 1
+                following, controller = max(following, position.step_size), NOTHING
+                if times.first < _NEAR * following:  # points so near say nothing of larger H
+                    memory = self._restarted_order()
+                    return Position(history.cut(), _end(step), following, memory, search)
+        smooth = None
+        if position.search.is_at_point:  # what T_n had does not belong to what follows
+            history, memory = history.newest(len(reached)), self._restarted_order()
+        elif defects is not None:
+            smooth = self._defects.of_accepted(step, defects, error)
         return Position(
             history,
             _end(step),
             following,
             memory,
+            search,
             controller,
-            bracket.after_acceptance(times.end),
             smooth,
             crossings=max(position.crossings - 1, 0),
         )
+
+    def _bound(
+        self,
+        step: DoubleStep,
+        error: StepError,
+        defects: Defects | None,
+        history: CouplingHistory,
+    ) -> Bound | None:
+        """The bound of the next H by inputs of which ERR tells nothing; None: there is none."""
+        inputs = None if defects is None else self._unanswered.of(defects, error)
+        if inputs is None:
+            return None
+        return self._unanswered.bound(inputs, history, step, error)
 
     def _reject(
         self,
@@ -413,29 +458,20 @@ class ControlledRun:
         defects: Defects | None,
         target: float,
     ) -> Position:
-        times, bracket = step.times, position.bracket
-        is_noticed = error.norm > 1.0 or not error.norm < _INF
-        if is_noticed and self._is_smallest(times, target):
+        times = step.times
+        if self._is_smallest(times, target):
             raise self._stuck(error, times)
-        reason = error.limiting_variable
-        if not is_noticed and defects is not None:
-            reason = f"{self._defects.name(defects)} jumps"
-        self._tell_rejected(times, step.polynomials, error.norm, reason)
+        self._tell_rejected(times, step.polynomials, error.norm, error.limiting_variable)
         _, following, controller = self._controller.decide(
             times.first, error.norm, self._control.exponent(step.polynomials), position.controller
         )
         kink = self._landing_points.inside(times)
         if kink is not None:  # the double step up to there is smooth
             following = max(following, (kink - times.begin) / 2.0)
-        if defects is None:
-            return position._replace(step_size=following, controller=controller)
-        is_search = bracket.end is not None or not is_noticed
-        if not is_search and not does_not_shrink(bracket, times.first, defects):
-            if bracket.rejected is None:
-                bracket = bracket._replace(rejected=(times.first, defects.largest))
-            return position._replace(step_size=following, controller=controller, bracket=bracket)
-        self._statistics.double_steps_at_discontinuities += 1
-        return position._replace(bracket=bracket.after_rejection(times, defects))
+        search = position.search
+        if defects is not None:
+            search = search.after_rejection(times.first, defects)
+        return position._replace(step_size=following, controller=controller, search=search)
 
     def _after_failure(
         self,
@@ -552,10 +588,12 @@ class ControlledRun:
         self, position: Position, step: DoubleStep, history: CouplingHistory
     ) -> Position:
         """Where to go on: the past says nothing any more."""
-        behind = Position(history.cut(), _end(step), position.step_size, self._restarted_order())
+        search = position.search.crossed()
+        order = self._restarted_order()
+        behind = Position(history.cut(), _end(step), position.step_size, order, search)
         if self._limits.quantum is not None:
-            order = OrderMemory(self._settings.polynomial)
-            behind = behind._replace(order=order, crossings=sum(self._crossings_behind_event))
+            whole = OrderMemory(self._settings.polynomial)
+            behind = behind._replace(order=whole, crossings=sum(self._crossings_behind_event))
         if step.times.end >= self._settings.end:
             return behind
         return self._with_initial_step_size(behind, position.step_size)
@@ -591,6 +629,57 @@ class ControlledRun:
         if following.crossings >= self._crossings_behind_event[1]:
             return following._replace(history=following.history.cut())
         return following
+
+    def _jumps(self, position: Position, step: DoubleStep, error: StepError) -> _Jumps:
+        """The inputs that jump in a double step, as far as defects tell."""
+        if not self._settings.discontinuities:
+            return _Jumps()
+        search, smooth = position.search, position.smooth
+        defects = self._defects.of(step, error.scale, position.history, smooth)
+        inputs = search.jumps(defects, step.times.first, is_accurate=error.norm <= 1.0)
+        if not inputs.any():
+            return _Jumps(defects, inputs)
+        return _Jumps(
+            defects,
+            inputs,
+            f"{self._defects.name(defects, inputs)} jumps",
+            are_answers=self._defects.are_answers(defects, inputs, smooth),
+            are_late=self._defects.are_late(inputs, smooth),
+        )
+
+    def _go_on_searching(
+        self,
+        position: Position,
+        step: DoubleStep,
+        error: StepError,
+        jumps: _Jumps,
+        change: tuple[str, Position] | None,
+    ) -> Position:
+        """Go back where something changes or inputs jump, or where a look at T_n met no jump."""
+        search = position.search
+        if change is not None:
+            name, following = change
+            self._tell_searched(step, error, f"{name} changes")
+            return following
+        if jumps.defects is None or jumps.inputs is None or not jumps.name:
+            self._tell_searched(step, error, "a look for a jump")
+            return position._replace(search=search.not_at_point())
+        self._tell_searched(step, error, jumps.name)
+        smallest = self._limits.smallest
+        return position._replace(
+            search=search.found(step.times, jumps.defects, jumps.inputs, smallest)
+        )
+
+    def _leave_to_estimate(
+        self, position: Position, step: DoubleStep, error: StepError, jumps: _Jumps
+    ) -> Position:
+        """Go back where slaves answer at T_n: no smaller H shows more, and ERR decides."""
+        assert jumps.inputs is not None  # as wherever inputs jump
+        search = position.search
+        self._statistics.late_jumps += jumps.are_late
+        self._statistics.double_steps_at_false_alarms += search.attempts + 1
+        self._tell_searched(step, error, f"{jumps.name} late" if jumps.are_late else jumps.name)
+        return position._replace(search=search.at_point(jumps.inputs))
 
     def _search_change(
         self, position: Position, step: DoubleStep, error: StepError, target: float
@@ -646,6 +735,10 @@ class ControlledRun:
             self._observer.attempted(
                 Attempt(times.begin, size, order, slopes, error.norm, True, limiting, points)
             )
+
+    def _tell_searched(self, step: DoubleStep, error: StepError, reason: str) -> None:
+        self._statistics.double_steps_at_discontinuities += 1
+        self._tell_rejected(step.times, step.polynomials, error.norm, reason)
 
     def _tell_rejected(
         self, times: DoubleStepTimes, polynomials: Polynomials, norm: float, reason: str

@@ -17,8 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from master_node.coupling_scheme import CouplingScheme, slaves_without_rollback
-from master_node.numerics.defect_control import TARGET, foreseen_step_size, largest_between
-from master_node.numerics.discontinuities import Defects, has_jumped_unnoticed
+from master_node.numerics.defect_control import (
+    TARGET,
+    defect_coefficients,
+    foreseen_step_size,
+    largest_between,
+)
+from master_node.numerics.discontinuities import are_jumps
 from master_node.numerics.error_estimators import node_polynomial
 from master_node.numerics.extrapolation import CouplingHistory, Extrapolation, Polynomials
 from master_node.numerics.norms import error_scale
@@ -33,8 +38,9 @@ class CouplingError(NamedTuple):
 
     Attributes:
         norm: root mean square of the weighted defects; above 1 they are beyond the tolerance.
-        limiting_variable: ``slave.variable`` behind the input with the largest one.
-        has_jumped: whether that one is so much larger than foreseen that only a jump explains it.
+        limiting_variable: ``slave.variable`` behind the input with the largest one, of those that
+            have jumped if any has.
+        has_jumped: whether one is so much larger than foreseen that only a jump explains it.
     """
 
     norm: float
@@ -79,7 +85,7 @@ class StepShape(Protocol):
         ...
 
 
-class SingleStep:
+class SingleStepShape:
     """One step of all slaves: all inputs are extrapolated, or known at its end.
 
     Args:
@@ -126,10 +132,10 @@ class SingleStep:
         )
 
 
-class DoubleStepBeforeLateSlaves:
-    """A double step of some slaves, after which the others take the same two steps.
+class DoubleStepShape:
+    """A double step; slaves that cannot go back take the same two steps when it is accepted.
 
-    The inputs that those before get from those behind have one polynomial for both steps.
+    The inputs that the others get from these have one polynomial for both steps.
 
     Args:
         scheme: how the slaves are coupled.
@@ -288,31 +294,25 @@ class CouplingDefects:
         norm = sqrt(weighted.dot(weighted) / len(weighted))
         has_jumped = False
         if weighted[index] > 1.0:
-            defects = Defects(
-                0.0,
-                float(weighted[index]),
-                max(TARGET, self._foreseen(history, polynomials, reached[0][0], scale, index)),
-                float(measured.changes[inputs[index]] / scale[index]),
-                int(inputs[index]),
-            )
-            has_jumped = has_jumped_unnoticed(defects)
+            foreseen = self._foreseen(history, polynomials, reached[0][0]) / scale
+            changes = measured.changes[inputs] / scale
+            jumping = are_jumps(weighted, changes, np.maximum(TARGET, foreseen))
+            has_jumped = bool(jumping.any())
+            if has_jumped:
+                index = int(np.where(jumping, weighted, 0.0).argmax())
         return CouplingError(norm, self._names[self._sources[index]], has_jumped)
 
     def _foreseen(
-        self,
-        history: CouplingHistory,
-        polynomials: Polynomials,
-        time: float,
-        scale: FloatArray,
-        index: int,
-    ) -> float:
-        """The weighted defect of one input that was foreseen for a (small) step to ``time``."""
+        self, history: CouplingHistory, polynomials: Polynomials, time: float
+    ) -> FloatArray:
+        """The defects that were foreseen for a (small) step to ``time``, shape (n_d,), unit [u]."""
         sizes = self._sizes(history, polynomials)
         if sizes is None:
-            return _INF
+            return np.full(len(self._inputs), _INF)
         now = history.times[0]
         reach = self._shape.reach(history.times, polynomials, time - now)
-        return float(sizes[index] / scale[index] * reach[self._kinds[index]])
+        foreseen: FloatArray = sizes * np.array(reach)[self._kinds]
+        return foreseen
 
     def step_size(
         self,
@@ -350,21 +350,6 @@ class CouplingDefects:
         return foreseen_step_size(norm, smallest, largest)
 
     def _sizes(self, history: CouplingHistory, polynomials: Polynomials) -> FloatArray | None:
-        """|u^(q+1) / (q+1)!| of each input, shape (n_d,), unit [u]/s^(q+1); None: not known.
-
-        The larger one of those at the two newest points: single ones pass through zero.
-        """
-        needed = max(polynomial.points for polynomial in polynomials)
-        sizes: FloatArray | None = None
-        for newest in range(min(2, len(history.times) - needed)):
-            past = history.before(newest + 1)
-            if self._extrapolation.known(polynomials, past) != polynomials:
-                continue
-            span = history.times[newest] - past.times[0]
-            foreseen = self._extrapolation.signal(past, polynomials).at(span)
-            nodes = self._extrapolation.nodes(past.times, polynomials, past.times[0])
-            products = np.array([node_polynomial(offsets, span) for offsets in nodes])
-            defects = np.abs(history.inputs[newest][0] - foreseen)[self._inputs]
-            found = defects / products[self._kinds]
-            sizes = found if sizes is None else np.maximum(sizes, found)
-        return sizes
+        """|u^(q+1) / (q+1)!| of each input, shape (n_d,), unit [u]/s^(q+1); None: not known."""
+        sizes = defect_coefficients(self._extrapolation, history, polynomials)
+        return None if sizes is None else sizes[self._inputs]

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from master_node.available_polynomials import AvailablePolynomials
-from master_node.coupling_defects import CouplingDefects, CouplingError, SingleStep
+from master_node.coupling_defects import CouplingDefects, CouplingError, SingleStepShape
 from master_node.missing_derivatives import MissingDerivatives
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.extrapolation import (
@@ -88,7 +88,7 @@ class DefectRun:
         self._crossings = crossings(context.system, self._limits, self._coupled.jumps)
         self._stepper = SingleStepper(context)
         self._missing = MissingDerivatives(context.coupled, scheme)
-        self._coupling = CouplingDefects(context.coupled, scheme, SingleStep(scheme))
+        self._coupling = CouplingDefects(context.coupled, scheme, SingleStepShape(scheme))
         self._available = AvailablePolynomials(scheme.extrapolation, coupling=self._coupling)
         self._ladder: tuple[InputPolynomial, ...] = ()
         if settings.order == "auto":
@@ -107,7 +107,11 @@ class DefectRun:
             DoublestepError: a slave was lost, or did not complete a step.
         """
         self._results = ResultPoints(
-            self._settings.output_grid, self._scheme.has_derivative, self._start, outputs
+            self._settings.output_grid,
+            self._coupled,
+            self._scheme.has_derivative,
+            self._start,
+            outputs,
         )
         if self._resumed is None:
             position = self._first_position(outputs)

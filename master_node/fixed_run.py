@@ -68,7 +68,7 @@ class FixedRun:
         missing = MissingDerivatives(coupled, scheme)
         missing.note(outputs.y, start)
         available = AvailablePolynomials(scheme.extrapolation)
-        results = ResultPoints(settings.output_grid, scheme.has_derivative, start, outputs)
+        results = ResultPoints(settings.output_grid, coupled, scheme.has_derivative, start, outputs)
         depth, u = wanted.order + 1 + scheme.known_ahead, coupled.inputs_of(outputs.y)
         history = (
             CouplingHistory.at_rest(start, u, depth, h)

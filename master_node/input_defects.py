@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from master_node.coupling_scheme import CouplingScheme
 from master_node.double_step import DoubleStep
-from master_node.numerics.discontinuities import Defects, measure
+from master_node.error_control import StepError
+from master_node.numerics.discontinuities import Defects, Inputs, SmoothStep
 from master_node.numerics.error_estimators import node_polynomial
 from master_node.numerics.extrapolation import CouplingHistory, highest
 from master_node.system import CoupledSystem
 from protocol.signals import FloatArray
+
+_GAIN = 1e6
+"""Tolerances by which an output jumps, at most, that answers to an input that is off by one."""
+
+
+_LATE = 10.0
+"""Tolerances by which an input is off that a slave should have answered to earlier."""
 
 
 class InputDefects:
@@ -24,13 +34,19 @@ class InputDefects:
         self._names = coupled.output_names
         self._extrapolation = scheme.extrapolation
         self._known_ahead = scheme.known_ahead
+        self._is_ahead = np.array([kind.ahead for kind in scheme.extrapolation.kinds])[
+            scheme.extrapolation.kind_of_input
+        ]
+        self._is_direct = scheme.feed_through.take(coupled.source)
+        self._slave_behind = coupled.output_slave.take(coupled.source)
+        self.number = len(coupled.source)
 
     def of(
         self,
         step: DoubleStep,
         scale: FloatArray,
         history: CouplingHistory,
-        smooth: tuple[float, float] | None,
+        smooth: SmoothStep | None,
     ) -> Defects:
         """The defects of a double step.
 
@@ -38,7 +54,7 @@ class InputDefects:
             step: the double step.
             scale: ATOL_j + RTOL_j |y_j| at its end, shape (m,), unit [y].
             history: up to T_n.
-            smooth: step size and largest defect of the last accepted step; None: there is none.
+            smooth: the last accepted step; None: there is none.
         """
         times = step.times
         input_scale = self._coupled.scale_of_inputs(scale)
@@ -48,32 +64,72 @@ class InputDefects:
             foreseen_middle = in_step(history, step.polynomials, times.first).end[0]
             foreseen_end = in_step(step.history, step.polynomials, times.second).end[0]
         u_middle, u_end = step.history.inputs[0][0], step.end_inputs[0]
-        middle, at_middle = measure(u_middle - foreseen_middle, input_scale)
-        end, at_end = measure(u_end - foreseen_end, input_scale)
-        if not max(middle, end) > 1.0:
-            return Defects(middle, end)
-        index, foreseen, before = at_end, foreseen_end, u_middle
-        if middle > end:
-            index, foreseen, before = at_middle, foreseen_middle, history.inputs[0][0]
-        change = abs(foreseen[index] - before[index]) / input_scale[index]
-        expected = middle * self._growth(step)
-        if smooth is not None:
-            size, largest = smooth
-            order = highest(step.polynomials).order
-            expected = max(expected, largest * (times.first / size) ** (order + 1))
-        return Defects(middle, end, expected, float(change), index)
+        middle = np.abs(u_middle - foreseen_middle) / input_scale
+        end = np.abs(u_end - foreseen_end) / input_scale
+        if not (middle > 1.0).any() and not (end > 1.0).any():
+            return Defects.within_tolerance(middle, end, input_scale)
+        expected = (
+            np.full(self.number, np.inf)
+            if smooth is None
+            else smooth.expected(times.first, highest(step.polynomials).order)
+        )
+        grown = middle * self._growth(step)
+        return Defects(
+            middle,
+            end,
+            np.abs(foreseen_middle - history.inputs[0][0]) / input_scale,
+            np.abs(foreseen_end - u_middle) / input_scale,
+            expected,
+            grown if smooth is None else np.maximum(expected, grown),
+            input_scale,
+        )
 
-    def _growth(self, step: DoubleStep) -> float:
-        """How much larger a defect at T_n + 2H is than at T_n + H where everything is smooth."""
+    def _growth(self, step: DoubleStep) -> FloatArray:
+        """Defects at T_n + 2H over those at T_n + H where all is smooth, shape (n,)."""
         begin, middle, end = step.times[:3]
         past = step.history.times
         first = self._extrapolation.nodes(past[1:], step.polynomials, begin)
         second = self._extrapolation.nodes(past, step.polynomials, begin)
-        return max(
+        growth = [
             abs(node_polynomial(later, end - begin) / node_polynomial(earlier, middle - begin))
             for earlier, later in zip(first, second, strict=True)
+        ]
+        return np.array(growth)[self._extrapolation.kind_of_input]
+
+    def of_accepted(self, step: DoubleStep, defects: Defects, error: StepError) -> SmoothStep:
+        """The defects to come, as an accepted double step lets expect them."""
+        weighted = np.abs(error.estimate).take(self._coupled.source)
+        weighted *= np.abs(self._coupled.factor)
+        echoes = weighted / self._coupled.scale_of_inputs(error.scale)
+        return SmoothStep(
+            step.times.first,
+            defects.largest,
+            np.where(self._is_direct, echoes, 0.0),
+            np.where(self._is_ahead, 0.0, defects.end),
         )
 
-    def name(self, defects: Defects) -> str:
-        """``slave.variable`` of the output behind the input with the largest defect."""
-        return self._names[int(self._coupled.source[defects.input_number])]
+    def are_answers(self, defects: Defects, jumping: Inputs, smooth: SmoothStep | None) -> bool:
+        """Tell whether inputs that jump at T_n are outputs that answer there to other inputs.
+
+        The polynomials of these had gone wrong by more than rounding up to T_n, where the next ones
+        begin with the true values.
+        """
+        off = self._corrections(smooth)
+        return bool((_GAIN * off >= defects.largest)[jumping].all())
+
+    def are_late(self, jumping: Inputs, smooth: SmoothStep | None) -> bool:
+        """Tell whether slaves behind inputs that jump had inputs off by over ten tolerances."""
+        return bool((self._corrections(smooth)[jumping] > _LATE).any())
+
+    def _corrections(self, smooth: SmoothStep | None) -> FloatArray:
+        """The largest correction at T_n of the inputs of the slave behind each input, (n,)."""
+        off = np.zeros(len(self._coupled.parts))
+        if smooth is not None:
+            for i, part in enumerate(self._coupled.parts):
+                off[i] = smooth.corrections[part.input_slice].max(initial=0.0)
+        return off[self._slave_behind]
+
+    def name(self, defects: Defects, jumping: Inputs) -> str:
+        """``slave.variable`` of the output behind the jumping input with the largest defect."""
+        index = int(np.where(jumping, defects.largest, -1.0).argmax())
+        return self._names[int(self._coupled.source[index])]

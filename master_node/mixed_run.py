@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from master_node.available_polynomials import AvailablePolynomials
 from master_node.controlled_run import ControlledRun, Position
-from master_node.coupling_defects import CouplingDefects, DoubleStepBeforeLateSlaves
+from master_node.coupling_defects import CouplingDefects, DoubleStepShape
 from master_node.double_step import DoubleStep, DoubleStepper, PartialDoubleStepper
 from master_node.error_control import ErrorControl, PartialErrorControl, StepError
 from master_node.late_slaves import LateSlaves
@@ -25,6 +25,7 @@ from master_node.order_selection import OrderSelection
 from master_node.outputs import Outputs
 from master_node.run_context import RunContext
 from master_node.step_requests import BrokenOffError
+from master_node.unanswered_inputs import Bound
 
 if TYPE_CHECKING:
     from master_node.configuration import SimulationSettings
@@ -45,7 +46,7 @@ class MixedRun(ControlledRun):
 
     def __init__(self, context: RunContext, estimator: ErrorEstimator) -> None:
         coupled, scheme = context.coupled, context.scheme
-        shape = DoubleStepBeforeLateSlaves(scheme)
+        shape = DoubleStepShape(scheme)
         self._late_slaves = LateSlaves(context.group, coupled, scheme)
         self._coupling = CouplingDefects(coupled, scheme, shape)
         super().__init__(context, estimator)
@@ -151,17 +152,22 @@ class _MixedOrderSelection(OrderSelection):
         self._coupling = coupling
 
     def _bounds(
-        self, candidates: Sequence[Candidate], history: CouplingHistory, step: DoubleStep
+        self,
+        candidates: Sequence[Candidate],
+        history: CouplingHistory,
+        step: DoubleStep,
+        bound: Bound | None,
     ) -> Mapping[InputPolynomial, float]:
         taken = step.times.first
-        return {
-            candidate.polynomial: self._coupling.step_size(
+        others = super()._bounds(candidates, history, step, bound)
+        bounds = {}
+        for polynomial in (candidate.polynomial for candidate in candidates):
+            by_defects = self._coupling.step_size(
                 history,
-                self._available.of(candidate.polynomial, history),
+                self._available.of(polynomial, history),
                 step.end[0],
                 smallest=SMALLEST_FACTOR * taken,
                 largest=LARGEST_FACTOR * taken,
             )
-            / taken
-            for candidate in candidates
-        }
+            bounds[polynomial] = min(by_defects / taken, others.get(polynomial, _INF))
+        return bounds

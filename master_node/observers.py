@@ -176,6 +176,9 @@ class Statistics:
         wall_time: seconds of the whole stepping phase.
         discontinuities: how many were found or declared.
         double_steps_at_discontinuities: attempts spent on finding and crossing them.
+        double_steps_at_false_alarms: those of them in searches that met no jump.
+        late_jumps: jumps by which slaves answered to inputs that turned out to be off by more than
+            ten tolerances: these may have called for the jump earlier.
         changes_at_smallest_step_size: changes of discrete outputs that are handed over late by more
             than the tolerance, or by an unknown error, because H cannot be smaller.
         steps_above_tolerance: double steps, or single ones where no slave has rollback, that had
@@ -189,6 +192,8 @@ class Statistics:
     rejected_double_steps: int = 0
     discontinuities: int = 0
     double_steps_at_discontinuities: int = 0
+    double_steps_at_false_alarms: int = 0
+    late_jumps: int = 0
     changes_at_smallest_step_size: int = 0
     steps_above_tolerance: int = 0
     round_trips: int = 0

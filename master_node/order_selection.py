@@ -23,6 +23,7 @@ from master_node.numerics.order_control import (
     ladder,
 )
 from master_node.system import CoupledSystem
+from master_node.unanswered_inputs import Bound
 from protocol.signals import FloatArray
 
 
@@ -78,7 +79,12 @@ class OrderSelection:
         return OrderMemory(beginning(self._ladder))
 
     def choose(
-        self, memory: OrderMemory, step: DoubleStep, error: StepError, history: CouplingHistory
+        self,
+        memory: OrderMemory,
+        step: DoubleStep,
+        error: StepError,
+        history: CouplingHistory,
+        bound: Bound | None = None,
     ) -> Choice:
         """After a double step was accepted.
 
@@ -87,6 +93,7 @@ class OrderSelection:
             step: the double step.
             error: its estimated error.
             history: up to its end.
+            bound: of H with some polynomials, by inputs of which the estimate tells nothing.
         """
         coupled = self._coupled
         slaves = len(coupled.parts)
@@ -123,17 +130,23 @@ class OrderSelection:
             error=np.sqrt(squares / self._control.outputs),
             step_size=step_size,
             alpha=self._alpha,
-            bounds=self._bounds(candidates, history, step),
+            bounds=self._bounds(candidates, history, step, bound),
         )
 
     def _bounds(
         self,
-        candidates: Sequence[Candidate],  # noqa: ARG002  for systems with more to consider
-        history: CouplingHistory,  # noqa: ARG002
-        step: DoubleStep,  # noqa: ARG002
+        candidates: Sequence[Candidate],
+        history: CouplingHistory,
+        step: DoubleStep,  # noqa: ARG002  for systems with more to consider
+        bound: Bound | None,
     ) -> Mapping[InputPolynomial, float]:
         """What bounds H over the present H, apart from the estimated error."""
-        return NO_BOUNDS
+        if bound is None:
+            return NO_BOUNDS
+        return {
+            candidate.polynomial: bound(self._available.of(candidate.polynomial, history))
+            for candidate in candidates
+        }
 
     def _next(
         self, polynomial: InputPolynomial, history: CouplingHistory, step_size: float

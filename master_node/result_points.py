@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from master_node.discrete_coupling import DiscreteValues
 from master_node.numerics.dense_output import OutputGrid, OutputHistory
+from master_node.numerics.norms import error_scale
 from master_node.observers import Point, Points, Statistics
 from master_node.outputs import Outputs
+from master_node.system import CoupledSystem
 from protocol.signals import FloatArray
 
 
@@ -52,6 +54,7 @@ class ResultPoints:
 
     Args:
         grid: where results are wanted; None: at the communication points.
+        coupled: the system, with its tolerances.
         has_derivative: which outputs come with their derivatives, shape (m,).
         time: T_0 [s].
         outputs: there.
@@ -60,11 +63,14 @@ class ResultPoints:
     def __init__(
         self,
         grid: OutputGrid | None,
+        coupled: CoupledSystem,
         has_derivative: NDArray[np.bool_],
         time: float,
         outputs: Outputs,
     ) -> None:
         self._grid = grid
+        self._absolute_tolerance = coupled.absolute_tolerance
+        self._relative_tolerance = coupled.relative_tolerance
         self._has_derivative = has_derivative
         self._history = OutputHistory((time,), (outputs.y,))
         self._d = outputs.d
@@ -94,7 +100,8 @@ class ResultPoints:
         held = self._held(times, reached)
         if not times:
             return ()
-        values = self._history.at(np.array(times), order, self._has_derivative)
+        scale = error_scale(reached[-1].y[0], self._absolute_tolerance, self._relative_tolerance)
+        values = self._history.at(np.array(times), order, self._has_derivative, scale)
         return tuple(map(Point, times, values, held))
 
     def jumped(self, reached: Reached) -> Points:

@@ -60,6 +60,36 @@ def test_communication_points_are_met_bit_for_bit() -> None:
         assert history.at(np.array([0.9]), 2, has_derivative)[0, 0] == np.sin(0.9)
 
 
+@given(
+    st.lists(st.floats(0.2, 3.0), min_size=4, max_size=4),
+    st.integers(0, 4),
+    st.floats(0.0, 1.0),
+    st.booleans(),
+)
+def test_no_polynomial_leads_over_a_jump(
+    gaps: list[float], jump: int, place: float, has_derivative: bool
+) -> None:
+    """Law: beside a jump a line is read as on each side; at its place the later side counts.
+
+    The jump lies in the gap of that number, before the first point with the last number.
+    """
+    points = np.cumsum([0.0, *gaps])
+    after = points[jump] if jump < 4 else -1.0  # the newest point before the jump
+
+    def outputs(t: float) -> np.ndarray:
+        return np.array([[0.1 * t + 100.0 * (t > after)], [0.1]])
+
+    history = OutputHistory((0.0,), (outputs(0.0),))
+    for time in points[1:]:
+        history = history.pushed(float(time), outputs(float(time)))
+    times = np.array([points[2] + place * (points[4] - points[2])])
+    read = history.at(times, 1, YES if has_derivative else NO, np.array([1e-4]))[0, 0]
+    if jump in {2, 3} and after < times[0] < points[jump + 1]:
+        assert read == outputs(float(points[jump + 1]))[0, 0]
+    else:
+        assert read == pytest.approx(outputs(float(times[0]))[0, 0], abs=1e-9)
+
+
 def test_each_output_is_read_by_what_it_has() -> None:
     """A mixed system: an output's values do not depend on what the others have."""
     rows = [(t, np.array([[np.sin(t), np.exp(t)], [np.cos(t), 0.0]])) for t in (0.0, 0.1, 0.25)]

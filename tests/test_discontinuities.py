@@ -12,14 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System, load_system, simulate
-from master_node.numerics.discontinuities import (
-    NO_JUMP,
-    Bracket,
-    Defects,
-    does_not_shrink,
-    has_jumped_unnoticed,
-    step_within,
-)
+from master_node.numerics.discontinuities import Defects, Search
 from master_node.numerics.double_step_times import DoubleStepTimes
 from protocol.errors import ConfigurationError
 from tests.quarter_car_case import EXAMPLES
@@ -181,51 +174,117 @@ def test_events_need_room() -> None:
 # ---- The parts ----------------------------------------------------------------------------------
 
 
-def defects(middle: float, end: float, expected: float = 0.0, change: float = 0.0) -> Defects:
-    """Of some double step."""
-    return Defects(middle, end, expected, change, 0)
+def defects(
+    middle: float, end: float, expected: float = 0.0, change: float = 0.0, beside: float = 0.0
+) -> Defects:
+    """Defects of a double step with an input, and one beside it whose defects are all alike."""
+    return Defects(
+        np.array([middle, beside]),
+        np.array([end, beside]),
+        np.array([change, beside]),
+        np.array([change, beside]),
+        np.array([expected, beside]),
+        np.array([expected, beside]),
+        np.ones(2),
+    )
 
 
-def test_what_is_like_a_jump() -> None:
-    """A defect above the tolerance that is more than a part of what was foreseen."""
-    assert defects(0.0, 2.0).is_like_a_jump
-    assert not defects(0.0, 0.9).is_like_a_jump
-    assert not defects(0.0, 2.0, change=10.0).is_like_a_jump
-    assert not defects(np.nan, np.nan).is_like_a_jump
+def jumps(search: Search, found: Defects, step_size: float = 1.0, *, accurate: bool = True) -> bool:
+    """Tell whether the first of both inputs jumps; the other one never does."""
+    first, other = search.jumps(found, step_size, is_accurate=accurate).tolist()
+    assert not other
+    return bool(first)
 
 
-def test_a_surprise_in_the_second_step_is_a_jump_nobody_noticed() -> None:
+@given(st.floats(0.0, 1e9))
+def test_each_input_is_judged_by_itself(beside: float) -> None:
+    """Law: what another input's defects are says nothing of one that jumps, or does not."""
+    nothing = Search.nothing(2)
+    assert jumps(nothing, defects(0.0, 5.0, beside=beside))
+    assert not jumps(nothing, defects(0.0, 5.0, expected=0.6, beside=beside))
+
+
+def test_a_surprise_in_the_second_step_is_a_jump_that_no_estimate_sees() -> None:
     """Ten times what was expected and twice the change foreseen; never one of the first step."""
-    assert has_jumped_unnoticed(defects(0.0, 5.0))
-    assert not has_jumped_unnoticed(defects(0.0, 5.0, expected=0.6))
-    assert not has_jumped_unnoticed(defects(0.0, 5.0, change=3.0))
-    assert not has_jumped_unnoticed(defects(6.0, 5.0))
+    nothing = Search.nothing(2)
+    assert jumps(nothing, defects(0.0, 5.0))
+    assert not jumps(nothing, defects(0.0, 0.9))
+    assert not jumps(nothing, defects(0.0, 5.0, expected=0.6))
+    assert not jumps(nothing, defects(0.0, 5.0, change=3.0))
+    assert not jumps(nothing, defects(6.0, 5.0))
+    assert not jumps(nothing, defects(np.nan, np.nan))
+
+
+def test_a_great_surprise_in_the_first_step_is_a_jump_where_err_is_content() -> None:
+    """Fifty times what was expected; nothing where ERR rejects, as H will shrink then."""
+    nothing = Search.nothing(2)
+    assert jumps(nothing, defects(100.0, 0.0, expected=1.0))
+    assert not jumps(nothing, defects(100.0, 0.0, expected=1.0), accurate=False)
+    assert not jumps(nothing, defects(40.0, 0.0, expected=1.0))
+    assert not jumps(nothing, defects(100.0, 0.0, expected=np.inf))  # nothing is known
 
 
 def test_a_defect_that_stays_while_the_step_shrinks() -> None:
     """Only a much smaller step says something; a smooth defect is gone by then."""
-    bracket = Bracket(rejected=(1.0, 8.0))
-    assert does_not_shrink(bracket, 0.2, defects(7.0, 0.0))
-    assert not does_not_shrink(bracket, 0.5, defects(7.0, 0.0))
-    assert not does_not_shrink(bracket, 0.2, defects(3.0, 0.0))
-    assert not does_not_shrink(NO_JUMP, 0.2, defects(7.0, 0.0))
+    search = Search.nothing(2).after_rejection(1.0, defects(8.0, 0.0))
+    assert jumps(search, defects(7.0, 0.0), 0.2, accurate=False)
+    assert not jumps(search, defects(7.0, 0.0), 0.5, accurate=False)
+    assert not jumps(search, defects(3.0, 0.0), 0.2, accurate=False)
+    assert not jumps(search, defects(7.0, 0.0, change=20.0), 0.2, accurate=False)
+    assert not jumps(Search.nothing(2), defects(7.0, 0.0), 0.2, accurate=False)
+
+
+def test_false_alarms_teach_and_jumps_are_believed_again() -> None:
+    """Law: after each false alarm a defect must be larger, of that input alone, until it jumps."""
+    search = Search.nothing(2)
+    sizes = []
+    for _ in range(3):
+        size = 1.01
+        while not jumps(search, defects(0.0, size)):
+            size *= 1.1
+        sizes.append(size)
+        times = DoubleStepTimes.from_step_size(0.0, 1.0)
+        search = search.found(times, defects(0.0, size), np.array([True, False]), 1e-9)
+        search = search.passed(2.0)  # no jump was met
+        assert search.end is None
+        assert search.doubts[1] == 1.0
+    assert sizes[2] > 3.0 * sizes[1] > 9.0 * sizes[0]
+    times = DoubleStepTimes.from_step_size(2.0, 1.0)
+    found = search.found(times, defects(0.0, 1e6), np.array([True, False]), 1e-9)
+    assert found.crossed().doubts.tolist() == [1.0, 1.0]
+
+
+def test_a_search_keeps_to_the_inputs_that_it_began_with() -> None:
+    """A defect of another input does not mislead it, nor a part of the jump's size."""
+    times = DoubleStepTimes.from_step_size(0.0, 1.0)
+    search = Search.nothing(2).found(times, defects(0.0, 100.0), np.array([True, False]), 1e-9)
+    assert jumps(search, defects(0.0, 100.0, beside=1e6))
+    assert not jumps(search, defects(0.0, 40.0, beside=1e6))
 
 
 @given(st.floats(0.0, 1.0), st.floats(1e-6, 1.0))
 def test_the_search_halves_the_bracket(jump: float, size: float) -> None:
     """Law: with exact knowledge of where a jump shows, the bracket shrinks to the smallest H."""
     time, smallest = 0.0, 1e-9
-    bracket = Bracket(size, (size / 2.0, 1.0), confirmed=True, size=1.0)
     place = max(jump * size, 2e-9)
+    first = DoubleStepTimes.from_step_size(0.0, size / 2.0)
+    jumping = np.array([True, False])
+    search, attempts = Search.nothing(2), 0
+    search = search.found(first, defects(float(place <= first.middle), 1.0), jumping, smallest)
     for _ in range(200):
-        h = step_within(bracket, time, size, smallest)
-        if h <= smallest:
-            break
+        h = search.step_size(time, size, smallest)
+        attempts += 1
         times = DoubleStepTimes.from_step_size(time, h)
-        if place <= times.end:
-            in_first = place <= times.middle
-            bracket = bracket.after_rejection(times, defects(float(in_first), 1.0))
+        is_inside = place <= times.end
+        if h <= smallest and is_inside:
+            break
+        if is_inside:
+            seen = defects(float(place <= times.middle), 1.0)
+            search = search.found(times, seen, jumping, smallest)
+        elif search.looks_at_point:
+            search = search.not_at_point()
         else:
-            bracket, time = bracket.after_acceptance(times.end), times.end
-            assert bracket.end is not None
+            search, time = search.passed(times.end), times.end
+            assert search.end is not None
     assert time <= place <= time + 8.0 * smallest
+    assert attempts <= 100

@@ -20,7 +20,7 @@ from typing_extensions import TypeAliasType
 
 from master_node import Result, System, load_system, open_system, resume, simulate
 from master_node.controlled_run import Position
-from master_node.numerics.discontinuities import Bracket
+from master_node.numerics.discontinuities import Search, SmoothStep
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
 from master_node.numerics.order_control import OrderMemory
 from master_node.observers import Attempt
@@ -480,8 +480,8 @@ def test_a_position_reads_back_to_the_same_bits() -> None:
         Outputs(array[:, :1].copy(), (1, 1.0, True, "text", b"\x00bytes", (1, 2.0))),
         1e-3,
         OrderMemory(InputPolynomial(2, 1), 3, None, 1, array),
-        bracket=Bracket(0.5, (1e-3, float("inf"))),
-        smooth=(1e-3, float("nan")),
+        Search(array[0], 0.5, array[1], (1e-3, array[1]), is_confirmed=True, firsts=1),
+        smooth=SmoothStep(float("nan"), array[0], array[1], array[0]),
     )
     again = from_plain(Position, json.loads(json.dumps(to_plain(position))))
     assert_same(again, position)

@@ -4,6 +4,10 @@ The solution has order k + 1. Outputs that come with derivatives are read from t
 polynomial through the newest three points, values and derivatives; the others from the polynomial
 through the newest k + 2 points. Both have an error of a higher order than the solution, so what is
 read between the points is of the same order as what is read at them.
+
+No polynomial leads over what has jumped. An output jumps between two points if it changes by far
+more than its tolerance and its slopes at both of them explain; where in between is not known. It
+has the later value there, and is read elsewhere through the points on the same side.
 """
 
 from __future__ import annotations
@@ -19,6 +23,9 @@ from protocol.signals import MAX_ORDER, FloatArray
 
 _DEPTH = MAX_ORDER + 2
 _HERMITE_POINTS = 3
+
+_STEEP = 10.0
+"""Factor by which a jump is above the tolerance, and above what slopes explain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +47,13 @@ class OutputHistory:
             (time, *self.times[: _DEPTH - 1]), (outputs, *self.outputs[: _DEPTH - 1])
         )
 
-    def at(self, times: FloatArray, order: int, has_derivative: NDArray[np.bool_]) -> FloatArray:
+    def at(
+        self,
+        times: FloatArray,
+        order: int,
+        has_derivative: NDArray[np.bool_],
+        scale: FloatArray | None = None,
+    ) -> FloatArray:
         """The outputs at ``times``, shape (s, m).
 
         Args:
@@ -48,27 +61,106 @@ class OutputHistory:
             order: k of the step.
             has_derivative: which outputs come with their derivatives, shape (m,); one that lacks
                 its derivative at a newest point is read as those without.
+            scale: ATOL_j + RTOL_j |y_j|, shape (m,), unit [y]; None: nothing jumps.
         """
+        has_derivative = self._with_slopes(has_derivative)
+        values = np.empty((len(times), has_derivative.size))
+        smooth = np.ones(has_derivative.size, dtype=bool)
+        if scale is not None and len(self.times) > 1:
+            jumps = self.jumps(has_derivative, scale)
+            smooth = np.logical_not(jumps.any(axis=0))
+            for j in np.flatnonzero(~smooth):
+                values[:, j] = self._beside_jumps(times, order, int(j), jumps[:, j], has_derivative)
+        plain, hermite = smooth & ~has_derivative, smooth & has_derivative
+        if plain.any():
+            values[:, plain] = self._polynomial(times, order, plain, has_derivative=False)
+        if hermite.any():
+            values[:, hermite] = self._polynomial(times, order, hermite, has_derivative=True)
+        return values
+
+    def jumps(self, has_derivative: NDArray[np.bool_], scale: FloatArray) -> NDArray[np.bool_]:
+        """Between which neighbouring points outputs jump, newest first, shape (points - 1, m).
+
+        A slope is the derivative, or that of the straight line over the interval beside it. An
+        output without derivatives has none yet at the newest point: the lines over both intervals
+        before count instead, as one alone may lie over an extremum.
+
+        Args:
+            has_derivative: which outputs come with their derivatives, shape (m,).
+            scale: ATOL_j + RTOL_j |y_j|, shape (m,), unit [y].
+        """
+        sizes = -np.diff(self.times)[:, np.newaxis]
+        values = np.array([y[0] for y in self.outputs])
+        changes = np.abs(np.diff(values, axis=0))
+        steep = np.full_like(changes, -1.0)  # where no slope is known
+        lines = changes / sizes
+        steep[:-1] = lines[1:]
+        np.maximum(steep[1:], lines[:-1], out=steep[1:])
+        steep[0] = np.maximum(lines[1], lines[2]) if len(lines) > 2 else -1.0
+        if has_derivative.any():
+            slopes = np.abs([y[1, has_derivative] for y in self.outputs])
+            steep[:, has_derivative] = np.maximum(slopes[1:], slopes[:-1])
+        is_known: NDArray[np.bool_] = steep >= 0.0
+        return is_known & (changes > _STEEP * scale) & (changes > _STEEP * sizes * steep)
+
+    def _beside_jumps(
+        self,
+        times: FloatArray,
+        order: int,
+        output: int,
+        jumps: NDArray[np.bool_],
+        has_derivative: NDArray[np.bool_],
+    ) -> FloatArray:
+        """One output at ``times``, read from the points that no jump divides from them, (s,)."""
+        values = np.empty(len(times))
+        column = np.array([output])
+        for i, time in enumerate(times.tolist()):
+            older = next(p for p in range(1, len(self.times)) if self.times[p] <= time)
+            if jumps[older - 1]:
+                at_point = self.times[older] == time
+                values[i] = self.outputs[older if at_point else older - 1][0, output]
+                continue
+            first = older - 1
+            while first > 0 and not jumps[first - 1]:
+                first -= 1
+            last = older
+            while last < len(jumps) and not jumps[last]:
+                last += 1
+            beside = OutputHistory(self.times[first : last + 1], self.outputs[first : last + 1])
+            has_slopes = bool(beside._with_slopes(has_derivative)[output])
+            read = beside._polynomial(times[i : i + 1], order, column, has_derivative=has_slopes)
+            values[i] = read[0, 0]
+        return values
+
+    def _with_slopes(self, has_derivative: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Outputs with derivatives that have them at all points of a Hermite polynomial, (m,)."""
+        if not has_derivative.any():
+            return has_derivative
+        known = [np.isfinite(y[1]) for y in self.outputs[:_HERMITE_POINTS]]
+        has_slopes: NDArray[np.bool_] = has_derivative & np.logical_and.reduce(known)
+        return has_slopes
+
+    def _polynomial(
+        self,
+        times: FloatArray,
+        order: int,
+        columns: NDArray[np.bool_] | NDArray[np.intp],
+        *,
+        has_derivative: bool,
+    ) -> FloatArray:
+        """Some outputs at ``times``, shape (s, number), by the polynomial through the points."""
         now = self.times[0]
         offsets = [time - now for time in self.times]
         tau = (times - now)[:, np.newaxis]
-        values = np.empty((len(times), has_derivative.size))
-        if has_derivative.any():
-            slopes_known = [np.isfinite(y[1]) for y in self.outputs[:_HERMITE_POINTS]]
-            has_derivative = has_derivative & np.logical_and.reduce(slopes_known)
-        plain = ~has_derivative
-        if plain.any():
+        if not has_derivative:
             nodes = offsets[: max(_HERMITE_POINTS, order + 2)]
-            points = [y[0, plain] for y in self.outputs[: len(nodes)]]
-            values[:, plain] = _newton(nodes, divided_differences(nodes, points), tau)
-        if has_derivative.any():
-            newest = self.outputs[:_HERMITE_POINTS]
-            nodes = [offset for offset in offsets[: len(newest)] for _ in range(2)]
-            points = [y[0, has_derivative] for y in newest for _ in range(2)]
-            slopes = [y[1, has_derivative] for y in newest]
-            differences = divided_differences(nodes, points, slopes)
-            values[:, has_derivative] = _newton(nodes, differences, tau)
-        return values
+            points = [y[0, columns] for y in self.outputs[: len(nodes)]]
+            return _newton(nodes, divided_differences(nodes, points), tau)
+        newest = self.outputs[:_HERMITE_POINTS]
+        nodes = [offset for offset in offsets[: len(newest)] for _ in range(2)]
+        points = [y[0, columns] for y in newest for _ in range(2)]
+        slopes = [y[1, columns] for y in newest]
+        return _newton(nodes, divided_differences(nodes, points, slopes), tau)
 
 
 def _newton(nodes: list[float], coefficients: list[FloatArray], tau: FloatArray) -> FloatArray:

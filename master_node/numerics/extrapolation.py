@@ -112,7 +112,11 @@ class CouplingHistory(NamedTuple):
 
     def cut(self) -> CouplingHistory:
         """The newest point alone: what was before a discontinuity says nothing any more."""
-        return CouplingHistory(self.times[:1], self.inputs[:1], self.depth)
+        return self.newest(1)
+
+    def newest(self, number: int) -> CouplingHistory:
+        """The ``number`` newest points alone."""
+        return CouplingHistory(self.times[:number], self.inputs[:number], self.depth)
 
     def before(self, number: int) -> CouplingHistory:
         """Without the ``number`` newest points, of which there must be fewer than of all."""

@@ -13,6 +13,7 @@ import numpy as np
 from master_node.observers import RunEnd, RunStart
 from master_node.results.columns import Columns
 from master_node.results.files import cannot_read, cannot_write, malformed, replacing
+from master_node.run_warnings import warnings_of
 
 
 def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> dict[str, Any]:
@@ -39,8 +40,11 @@ def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> d
             "rejected_double_steps": statistics.rejected_double_steps,
             "discontinuities": statistics.discontinuities,
             "double_steps_at_discontinuities": statistics.double_steps_at_discontinuities,
+            "double_steps_at_false_alarms": statistics.double_steps_at_false_alarms,
+            "late_jumps": statistics.late_jumps,
             "changes_at_smallest_step_size": statistics.changes_at_smallest_step_size,
             "steps_above_tolerance": statistics.steps_above_tolerance,
+            "warnings": warnings_of(statistics),
             "controlled_by": start.control._asdict(),
             "state_kind": start.state_kinds,
             "smallest_step_size": statistics.smallest_step_size,
