@@ -12,6 +12,7 @@ from benchmarks import (
     in_process,
     many_variables,
     memory,
+    nemesis,
     over_zenoh,
     recovery,
     saved_states,
@@ -67,6 +68,7 @@ CHECKS = {
     "fault_points": fault_points.main,
     "fault_schedules": fault_schedules.main,
     "fuzz": fuzz.main,
+    "nemesis": nemesis.main,
 }
 """With their own options; they end with an error when something did not hold."""
 

@@ -20,6 +20,7 @@ from protocol.endpoints import LOOPBACK
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
 from protocol.interruption import interruptible
 from protocol.logs import LogFormat, about, configure_logs, logs_json
+from protocol.standard_error import forgive_standard_error
 from protocol.standard_output import guarded_standard_output, output_of_others
 from protocol.terminal import say, say_error, say_json
 from protocol.threads import start_thread
@@ -538,6 +539,7 @@ def _end_with_parent() -> None:
 
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
+    forgive_standard_error()
     configure_logs(LogFormat.TEXT, _TEXT_FORMAT)
     try:
         with guarded_standard_output():

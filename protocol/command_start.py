@@ -41,5 +41,7 @@ def run_command(name: str, module: str) -> None:
 
 def _end(message: str, exit_code: int) -> NoReturn:
     """At once: nothing of the interpreter is to be tidied up."""
-    os.write(2, f"{printable(message)}\n".encode(errors="replace"))
-    os._exit(exit_code)
+    try:
+        os.write(2, f"{printable(message)}\n".encode(errors="replace"))
+    finally:  # on a full disk, too
+        os._exit(exit_code)

@@ -115,6 +115,18 @@ def _probes(endpoints: Sequence[str], credentials: Credentials | None) -> list[P
     return probe_all(endpoints, credentials, _PROBE_TIME)
 
 
+_processes: set[int] = set()
+"""In which Zenoh runs its threads: this one, or one from which it was forked."""
+
+
+def _check_not_forked() -> None:
+    if _processes and os.getpid() not in _processes:
+        raise ConfigurationError(
+            "this process was forked from one that has used the bus, which does not work here",
+            remedy="start it afresh, as by multiprocessing.get_context('spawn'), or run in process",
+        )
+
+
 def _session(endpoints: Endpoints, largest: int) -> zenoh.Session:
     try:
         return zenoh.open(_config(endpoints, largest))
@@ -171,8 +183,8 @@ class ZenohBus(Bus):
         largest: length of the largest message that is received [bytes]; Zenoh drops longer ones.
 
     Raises:
-        ConfigurationError: an address cannot be listened on, or who is there does not accept our
-            certificate.
+        ConfigurationError: an address cannot be listened on, who is there does not accept our
+            certificate, or this process was forked from one that has used the bus.
         SlaveLostError: a client found no router in time.
     """
 
@@ -183,6 +195,8 @@ class ZenohBus(Bus):
         stop: threading.Event | None = None,
         largest: int = MAX_MESSAGE_BYTES,
     ) -> None:
+        _check_not_forked()
+        _processes.add(os.getpid())
         zenoh.init_log_from_env_or("off")
         probes = probe_all(_secured(endpoints), endpoints.credentials, _PROBE_TIME)
         for attempt in probes:

@@ -31,6 +31,7 @@ from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.processes import ending_signals
 from protocol.scratch import ScratchDirectory
 from protocol.slave import StartValue
+from protocol.standard_error import forgive_standard_error
 from protocol.standard_output import guarded_standard_output, output_of_others
 from protocol.terminal import say, say_error, say_json
 from protocol.threads import start_thread
@@ -518,6 +519,7 @@ def _end_with_parent(end: Callable[[str], None]) -> None:
 
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
+    forgive_standard_error()
     try:
         with guarded_standard_output():
             app()

@@ -36,6 +36,7 @@ from protocol.logs import LogFormat, configure_logs
 from protocol.python_processes import restore_path, safe_path
 from protocol.scratch import ScratchDirectory
 from protocol.slave import CallExecutor, SlaveDescription, StartValue
+from protocol.standard_error import forgive_models
 from protocol.threads import LIMITS, start_thread
 from slave_node.deaths import OWN_FAILURE, death, how_ended
 from slave_node.pipe import Pipe
@@ -271,6 +272,7 @@ def _end_with(worker: int, pipe: Pipe) -> None:
 
 def _main(end: socket.socket, reference: ModelReference, scratch: str) -> None:
     """Load the model, then execute programs until the node says end or is gone."""
+    forgive_models()
     try:
         _hold(end, reference, scratch)
     except Exception:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -440,3 +443,35 @@ def test_a_malformed_endpoint_is_refused_with_the_form(text: str) -> None:
     """Nothing but ``tcp/HOST:PORT``, even where insecure addresses are allowed."""
     with pytest.raises(ConfigurationError, match=r"is not an endpoint; write tcp/HOST:PORT"):
         Endpoints(connect=(text,), insecure=True)
+
+
+FORKED = """
+import os, signal
+from protocol.endpoints import Endpoints
+from protocol.errors import ConfigurationError
+from protocol.zenoh_bus import ZenohBus
+
+def opens() -> bool:
+    try:
+        ZenohBus(Endpoints()).close()
+    except ConfigurationError as error:
+        assert "forked" in error.cause and "spawn" in error.remedy
+        return False
+    return True
+
+def opens_in_a_fork() -> bool:
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if opens() else 1)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+assert opens_in_a_fork(), "nothing of the bus was there to inherit"
+assert opens() and opens()
+assert not opens_in_a_fork(), "the threads of the bus are those of the other process"
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="forks")
+def test_a_fork_of_a_process_that_has_used_the_bus_is_refused_one() -> None:
+    """As by `multiprocessing` where it forks: told with the remedy, where Zenoh would hang."""
+    subprocess.run([sys.executable, "-c", FORKED], check=True, timeout=BOUND)

@@ -21,6 +21,7 @@ from protocol.calls import Configure, Reply
 from protocol.codec import decode_map, decode_program, encode_error, encode_reply
 from protocol.errors import DoublestepError, SlaveError
 from protocol.slave import CallExecutor, Slave
+from protocol.standard_error import forgive_models
 from slave_node.executor import Executor
 from slave_node.loading import load_model
 from slave_node.states.channel import DURATION, PROCESS, Channel, Message
@@ -38,6 +39,7 @@ def hold(connection: socket.socket, obituaries: int) -> NoReturn:
         connection: on which this process is driven.
         obituaries: descriptor of the pipe into which deaths of copies are written.
     """
+    forgive_models()
     channel = Channel(connection)
     channel.send(Message.DONE, PROCESS.pack(os.getpid()))
     hindrances = ForkHindrances()
