@@ -24,6 +24,7 @@ from slave_node.fmu.interfaces import (
     interface_2,
     interface_3,
 )
+from slave_node.fmu.repairs import repair
 from slave_node.fmu.units import units
 from slave_node.fmu.variables import Place, Variables, read_variables
 
@@ -83,7 +84,8 @@ def read_fmu(
     try:
         root = ElementTree.parse(directory / DESCRIPTION).getroot()
         read_interface = _version(root)
-        model_description = read_model_description(str(directory), validate=False)
+        repairs = repair(root)
+        model_description = _read(directory, root if repairs else None)
         interface = read_interface(model_description, root)
         variables = read_variables(model_description, root, structural_parameters or {})
         return FmuModel(
@@ -95,7 +97,11 @@ def read_fmu(
                 root,
                 interface,
                 variables,
-                remarks=(*_hidden(variables), *_remarks(directory, model_description, interface)),
+                remarks=(
+                    *repairs,
+                    *_hidden(variables),
+                    *_remarks(directory, model_description, interface),
+                ),
             ),
             interface,
             variables.places,
@@ -107,6 +113,16 @@ def read_fmu(
         raise ModelError(f"{fmu}: {error.cause}", remedy=error.remedy) from error
     except Exception as error:  # fmpy raises whatever its XML and type conversions raise
         raise ModelError(f"{fmu}: {DESCRIPTION} cannot be read: {error}") from error
+
+
+def _read(directory: Path, mended: Element | None) -> Any:
+    """The model description as fmpy reads it; in place of the file one that was mended."""
+    if mended is None:
+        return read_model_description(str(directory), validate=False)
+    with ScratchDirectory() as place:
+        file = Path(place) / DESCRIPTION
+        ElementTree.ElementTree(mended).write(file, encoding="utf-8", xml_declaration=True)
+        return read_model_description(str(file), validate=False)
 
 
 _INTERFACES: Mapping[str, Callable[[Any, Element], Interface]] = {
