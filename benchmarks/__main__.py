@@ -4,6 +4,7 @@ import sys
 
 from benchmarks import (
     attacks,
+    corpus,
     coverage_guided,
     emulated_inputs,
     fault_points,
@@ -64,6 +65,7 @@ TABLES = {
 
 CHECKS = {
     "attacks": attacks.main,
+    "corpus": corpus.main,
     "coverage_guided": coverage_guided.main,
     "fault_points": fault_points.main,
     "fault_schedules": fault_schedules.main,
