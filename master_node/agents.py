@@ -299,6 +299,7 @@ class Agents:
             model=model,
             requires=requires,
             restart=self._restarts.get(wanted.slave, 0),
+            load_timeout=float(self._system.bus.load_timeout),
         )
         self._used.add(seen.key)
         started = ask_agent(self._bus, seen.key, START, request, SlaveStarted, timeout=_START_TIME)

@@ -36,7 +36,7 @@ from master_node.run_warnings import warnings_of
 from master_node.slave_group import SlaveGroup
 from master_node.system import CoupledSystem
 from protocol.calls import Terminate
-from protocol.errors import ConfigurationError, InterruptedRunError
+from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
 from protocol.slave import VariableType
 
 log = logging.getLogger("master_node")
@@ -211,8 +211,9 @@ class CoSimulation:
             finally:
                 update()
                 self.group.restart_statistics()
-            self._terminate(statistics.time)
-            outcome, message = (Outcome.TERMINATED, note) if note else (Outcome.COMPLETED, "")
+            failure = self._terminate(statistics.time)
+            outcome = Outcome.TERMINATED if note else Outcome.COMPLETED
+            message = "; ".join(filter(None, (note, failure)))
         except KeyboardInterrupt:
             outcome, message = Outcome.INTERRUPTED, f"interrupted at t={statistics.time!r} s"
             raise InterruptedRunError(message) from None
@@ -256,5 +257,18 @@ class CoSimulation:
             return MixedRun(context, estimator).run(outputs)
         return ControlledRun(context, estimator).run(outputs)
 
-    def _terminate(self, time: float) -> None:
-        self.group.execute_all([(Terminate(),)] * len(self.group), time)
+    def _terminate(self, time: float) -> str:
+        """Terminate all slaves at the end [s]; the results are complete, whatever they say to it.
+
+        Returns:
+            What went wrong in words, which is a warning, too; or "".
+        """
+        try:
+            replies = self.group.execute([(Terminate(),)] * len(self.group), time)
+            errors = [reply.error for reply in replies if reply.error is not None]
+        except DoublestepError as error:
+            errors = [error]
+        failures = [str(error) for error in errors]
+        for failure in failures:
+            log.warning("the run is complete, but: %s", failure)
+        return "; ".join(failures)

@@ -37,6 +37,7 @@ from master_node.numerics.dense_output import OutputGrid
 from master_node.numerics.extrapolation import InputPolynomial
 from master_node.places import SspPlaces, SystemFilePlaces
 from master_node.toml_files import read_located_tables
+from protocol.administration import DEFAULT_LOAD_TIMEOUT
 from protocol.agents import check_label, is_sha256
 from protocol.errors import ConfigurationError
 from protocol.keys import check_name
@@ -116,6 +117,7 @@ def _mapping(value: Any) -> Mapping[bool, bool] | Mapping[int, int]:
 
 Number = Annotated[StrictFloat, AfterValidator(_finite)]
 Positive = Annotated[Number, Field(gt=0)]
+Wait = Annotated[Number, Field(gt=0, le=1e6)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Reference = Annotated[StrictStr, AfterValidator(_reference)]
 Pattern = Annotated[StrictStr, AfterValidator(_pattern)]
@@ -604,8 +606,10 @@ class BusSettings(_Table):
         connect: slaves that listen, or the router; default of a client: the loopback port 7447.
         insecure: allow addresses other than loopback without TLS.
         tls: directory with certificates, relative to the system file; None: no TLS.
-        discovery_timeout: how long to wait for slaves to appear [s].
-        step_timeout: how long one request may take [s].
+        discovery_timeout: how long to wait for slaves and agents that are not started here [s].
+        load_timeout: how long a model may take to be loaded, loaded anew or reset [s].
+        initialization_timeout: how long a request in initialization mode may take [s].
+        step_timeout: how long a request of up to three do_steps may take [s].
         reconnect_time: how long to wait in mid run for a slave whose connection was lost [s].
         pin: keep the node and the worker of each launched slave on one processor, so that a
             request is handed over without waking another one. For small models; a model with
@@ -617,8 +621,10 @@ class BusSettings(_Table):
     connect: tuple[StrictStr, ...] = ()
     insecure: StrictBool = False
     tls: StrictStr | None = None
-    discovery_timeout: Positive = 30.0
-    step_timeout: Positive = 60.0
+    discovery_timeout: Wait = 30.0
+    load_timeout: Wait = DEFAULT_LOAD_TIMEOUT
+    initialization_timeout: Wait = 600.0
+    step_timeout: Wait = 60.0
     reconnect_time: Annotated[Number, Field(gt=0, le=3000)] = 10.0
     pin: StrictBool = False
 

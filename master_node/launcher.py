@@ -52,16 +52,24 @@ class Launcher:
         run: its id.
         connection: options of ``slave-node serve`` that lead the slaves to the bus.
         log_directory: existing; gets ``NAME.log`` of each slave.
+        load_timeout: a model may take to be loaded or reset [s].
         pin: give each slave one processor of its own, in turn, where the platform can.
     """
 
     def __init__(
-        self, run: str, connection: Sequence[str], log_directory: Path, *, pin: bool = False
+        self,
+        run: str,
+        connection: Sequence[str],
+        log_directory: Path,
+        *,
+        load_timeout: float,
+        pin: bool = False,
     ) -> None:
         self._run = run
         self._connection = connection
         self._processors = _processors() if pin else []
         self._log_directory = log_directory
+        self._load_timeout = load_timeout
         self._processes: dict[str, SlaveProcess] = {}
         # What a slave that is killed leaves behind goes with it.
         self._scratch = ScratchDirectory()
@@ -91,6 +99,7 @@ class Launcher:
             base,
             key,
             connection=self._connection,
+            load_timeout=self._load_timeout,
             log=self._log_directory / f"{name}.log",
             scratch=self._scratch.path,
             processor=processor,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 
 from master_node.launcher import Starter
 from master_node.remote_slave import RemoteSlave, slave_status
 from protocol.bus import Bus
 from protocol.clock import SYSTEM_CLOCK, Clock
-from protocol.errors import DoublestepError, ProtocolError, SlaveLostError
+from protocol.errors import DeadlineError, DoublestepError, ProtocolError, SlaveLostError
 from protocol.keys import SlaveKey, alive_slaves
 from protocol.names import some
 
@@ -20,6 +20,7 @@ _POLL_TIME = 0.02
 _GRACE_TIME = 0.1  # a process that is just dying is soon known to be dead
 _LIVELINESS_TIME = 1.0
 _END_TIME = 5.0
+_START_TIME = 15.0  # of a process, before it loads its model, and which says itself if that is late
 _SHOWN_INSTANCES = 4
 
 
@@ -56,32 +57,45 @@ class Presence:
         names: list[str],
         keys: Mapping[str, SlaveKey],
         starters: Sequence[Starter],
-        timeout: float,
+        *,
+        discovery_timeout: float,
+        load_timeout: float,
     ) -> dict[str, SlaveKey]:
-        """Wait until slaves called ``names`` and those at ``keys`` are alive.
+        """Wait until slaves called ``names`` and those at ``keys``, which were started, are alive.
+
+        Args:
+            names: of slaves that are found.
+            keys: of slaves that were started, by name.
+            starters: of these.
+            discovery_timeout: bound on the wait for those that are found [s].
+            load_timeout: the others may take so long to load their models [s].
 
         Returns:
             The keys of the slaves called ``names``.
 
         Raises:
-            SlaveLostError: a slave did not appear within ``timeout`` seconds; says what was found.
+            SlaveLostError: a slave did not appear in time; says what was found.
             ModelError, SlaveCrashedError, SlaveLostError: one that was started ended.
             ProtocolError: two slaves are found by one name.
         """
-        deadline = self._clock.monotonic() + timeout
+        begin = self._clock.monotonic()
         while True:
             for starter in starters:
                 starter.check()
             with self._changed:
                 alive = set(self._alive)
             missing = [n for n in names if not any(_is_called(n, k) for k in alive)]
-            missing += [name for name, key in keys.items() if key not in alive]
-            found = {} if missing else self._only_instances(names)
-            missing = missing or [name for name in names if name not in found]
-            if not missing:
-                return found
-            if self._clock.monotonic() > deadline:
-                raise self._not_found(missing, keys, alive, timeout)
+            loading = [name for name, key in keys.items() if key not in alive]
+            if not missing and not loading:
+                found = self._only_instances(names)
+                missing = [name for name in names if name not in found]
+                if not missing:
+                    return found
+            waited = self._clock.monotonic() - begin
+            if missing and waited > discovery_timeout:
+                raise self._not_found(missing, alive, discovery_timeout)
+            if loading and waited > load_timeout + _START_TIME:
+                raise self._not_loaded(loading, load_timeout)
             with self._changed:
                 self._changed.wait(_POLL_TIME)
 
@@ -104,14 +118,15 @@ class Presence:
                 found[name] = instances[0]
         return found
 
-    def wait_for(self, key: SlaveKey, starter: Starter, timeout: float) -> None:
+    def wait_for(self, key: SlaveKey, starter: Starter, load_timeout: float) -> None:
         """Wait until a slave that was started again is alive.
 
         Raises:
-            SlaveLostError: it did not appear within ``timeout`` seconds, or ended.
+            DeadlineError: it was not loaded within ``load_timeout`` seconds.
+            SlaveLostError: it ended.
             ModelError: it ended because its model cannot be used.
         """
-        deadline = self._clock.monotonic() + timeout
+        deadline = self._clock.monotonic() + load_timeout + _START_TIME
         while True:
             error = starter.ended(key.name)  # may ask another host: not while tokens are told of
             with self._changed:
@@ -120,7 +135,7 @@ class Presence:
                 if error is not None:
                     raise error
                 if self._clock.monotonic() > deadline:
-                    raise self._not_found([key.name], {key.name}, set(self._alive), timeout)
+                    raise self._not_loaded([key.name], load_timeout)
                 self._changed.wait(_POLL_TIME)
 
     def follow(self, remote: RemoteSlave) -> None:
@@ -133,20 +148,23 @@ class Presence:
             remote.lost()
 
     @staticmethod
-    def _not_found(
-        missing: list[str], started: Collection[str], alive: set[SlaveKey], timeout: float
-    ) -> SlaveLostError:
+    def _not_found(missing: list[str], alive: set[SlaveKey], timeout: float) -> SlaveLostError:
         there = some(sorted({k.name for k in alive})) or "no slave at all"
-        loading = all(name in started for name in missing)
         return SlaveLostError(
             f"did not appear within {timeout:g} s; found on the bus: {there}",
             slave=", ".join(missing),
             phase="discovery",
-            remedy="its process was started and still loads the model: wait longer with --timeout, "
-            "or look into its log"
-            if loading
-            else "start it with `slave-node serve MODEL --name NAME`, or check --connect "
-            "and --listen on both sides",
+            remedy="start it with `slave-node serve MODEL --name NAME`, check --connect and "
+            "--listen on both sides, or wait longer with --timeout",
+        )
+
+    @staticmethod
+    def _not_loaded(loading: list[str], timeout: float) -> DeadlineError:
+        return DeadlineError(
+            f"the model was not loaded within {timeout:g} s",
+            slave=", ".join(loading),
+            phase="load",
+            remedy="look into its log; if it is only slow, raise load_timeout in [bus]",
         )
 
     def _whereabouts(self, key: SlaveKey) -> str:

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from secrets import token_hex
 
+from master_node.request_bounds import RequestBounds, RequestClock
 from protocol.administration import Claim, Claimed, claim_name
 from protocol.bus import Bus, Caller, PendingReply
-from protocol.calls import Call, Reply
+from protocol.calls import Call, Reply, Terminate
 from protocol.clock import SYSTEM_CLOCK, Clock
 from protocol.codec import (
     decode_map,
@@ -19,12 +20,12 @@ from protocol.codec import (
     encode_program,
     encode_request,
 )
-from protocol.errors import DoublestepError, SequenceError, SlaveLostError
+from protocol.errors import DeadlineError, DoublestepError, SequenceError, SlaveLostError
 from protocol.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey
 from protocol.processes import PeerProcess
 from protocol.slave import StartValue
 
-_CLAIM_TIME = 90.0  # a slave whose worker died loads its model again first
+_CLAIM_MARGIN = 5.0
 _RELEASE_TIME = 5.0
 _GOODBYE_TIME = 0.3
 _STATUS_TIME = 0.5
@@ -53,7 +54,7 @@ class RemoteSlave:
         bus: opened.
         key: of the slave.
         run: id of the run that claims it.
-        step_timeout: bound on one request [s].
+        bounds: on its requests, by what they have it do. A claim may take as long as loading.
         reconnect_time: how long in all a request waits for a slave that is not on the bus [s].
             The slave is told to wait longer than that for its master.
         clock: for its waits.
@@ -69,20 +70,22 @@ class RemoteSlave:
         key: SlaveKey,
         *,
         run: str,
-        step_timeout: float,
+        bounds: RequestBounds,
         reconnect_time: float,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._bus = bus
         self._key = key
-        self._step_timeout = step_timeout
+        self._load_timeout = bounds.load_timeout
+        self._bounds = RequestClock(bounds)
         self._reconnect_time = reconnect_time
         self._clock = clock
         self._changed = clock.condition()
         self._is_present = True
         self._loss: tuple[str, str] | None = None
-        self._execute = self._caller()
+        self._callers: dict[float, Caller] = {}
         self._calls: Sequence[Call] = ()
+        self._bound = self._bounds.bound(())
         self._payload = b""
         self._pending: PendingReply | None = None
         wait = orphan_time(reconnect_time)
@@ -90,16 +93,40 @@ class RemoteSlave:
         self._take()
 
     def _take(self) -> None:
-        """Claim it."""
-        caller = self._bus.caller(self._key.verb(CLAIM), _CLAIM_TIME)
-        data = caller.request(encode_map(self._claim.to_message()))
+        """Claim it: it is reset for that, or its model is loaded again."""
+        caller = self._bus.caller(self._key.verb(CLAIM), self._load_timeout + _CLAIM_MARGIN)
+        try:
+            data = caller.request(encode_map(self._claim.to_message()))
+        except DeadlineError as error:
+            error.remedy = "if the model is only slow to load, raise load_timeout in [bus]"
+            raise
         claimed = Claimed.from_message(decode_map(data))
         self._epoch, self._claim_name = claimed.epoch, claim_name(claimed.epoch)
         self._sequence = 0
         self._process = PeerProcess(claimed.host, claimed.pid)
 
     def _caller(self) -> Caller:
-        return self._bus.caller(self._key.verb(EXECUTE), self._step_timeout)
+        """The caller for requests with the bound of the present one; it may be cancelled."""
+        seconds = self._bound.seconds
+        caller = self._callers.get(seconds)
+        if caller is None:
+            caller = self._new_caller()
+            with self._changed:
+                self._callers[seconds] = caller  # from here on a loss cancels it
+                is_lost = not self.is_present
+            if is_lost:
+                caller.cancel()
+        return caller
+
+    def _new_caller(self) -> Caller:
+        return self._bus.caller(self._key.verb(EXECUTE), self._bound.seconds)
+
+    def _cancel(self) -> None:
+        """End what waits for a reply."""
+        with self._changed:
+            callers = list(self._callers.values())
+        for caller in callers:
+            caller.cancel()
 
     @property
     def key(self) -> SlaveKey:
@@ -125,21 +152,31 @@ class RemoteSlave:
         """See `SlaveLink`."""
         self._sequence += 1
         self._calls = calls
+        self._bound = self._bounds.bound(calls)
         self._payload = encode_request(self._epoch, self._sequence, encode_program(calls))
         try:
-            self._pending = self._execute.send(self._payload)
+            self._pending = self._caller().send(self._payload)
         except SlaveLostError:
             self._pending = None
 
     def finish(self) -> Reply:
         """See `SlaveLink`."""
         try:
-            data = self._pending.result() if self._pending else None
-        except SlaveLostError:
-            data = None
-        if data is None:
-            data = self._ask_again()
-        return decode_reply(self._calls, data)
+            data = self._answer()
+        except DeadlineError as error:
+            error.remedy = self._bound.remedy
+            if type(self._calls[0]) is Terminate:
+                self.abort()  # nothing follows that would
+            raise
+        reply = decode_reply(self._calls, data)
+        self._bounds.took(reply)
+        return reply
+
+    def _answer(self) -> bytes:
+        if self._pending is not None:
+            with suppress(SlaveLostError):
+                return self._pending.result()
+        return self._ask_again()
 
     def _ask_again(self) -> bytes:
         """No reply means a connection that was lost, or one that is just coming back."""
@@ -157,9 +194,9 @@ class RemoteSlave:
         """Wait until the slave is on the bus; the old caller may have been cancelled."""
         with self._changed:
             came = self._changed.wait_for(lambda: self._is_present or self._loss, max(timeout, 0.0))
-        caller = self._caller()
+        caller = self._new_caller()
         with self._changed:
-            self._execute = caller  # from here on a loss cancels this one
+            self._callers = {self._bound.seconds: caller}  # from here on a loss cancels this one
             if self._loss is not None:
                 slave, cause = self._loss
                 raise SlaveLostError(cause, slave=slave, remedy=_REMEDY)
@@ -174,8 +211,7 @@ class RemoteSlave:
         """Its liveliness token went away: let pending waits end now."""
         with self._changed:
             self._is_present = False
-            caller = self._execute
-        caller.cancel()
+        self._cancel()
 
     def returned(self) -> None:
         """Its liveliness token is there again."""
@@ -187,9 +223,8 @@ class RemoteSlave:
         """The run ends because of ``slave``: wait no more, neither for that one nor for this."""
         with self._changed:
             self._loss = (slave, cause)
-            caller = self._execute
             self._changed.notify_all()
-        caller.cancel()
+        self._cancel()
 
     def renew(self) -> None:
         """Have its worker replaced by a new one that holds the model as it was loaded first.

@@ -64,7 +64,7 @@ class Restarts:
             raise SlaveLostError("its process is gone, and it was not started for this run")
         self._presence.forget(remote)
         key, starter = self._start(name)
-        self._presence.wait_for(key, starter, self._system.bus.discovery_timeout)
+        self._presence.wait_for(key, starter, float(self._system.bus.load_timeout))
         self._remotes[name] = remote = self._claim(key)
         self._presence.follow(remote)
         return remote

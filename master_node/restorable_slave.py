@@ -26,6 +26,7 @@ from protocol.calls import (
     Reply,
     SerializeState,
     SetState,
+    Terminate,
 )
 from protocol.codec import MAX_CALLS
 from protocol.errors import (
@@ -173,6 +174,8 @@ class RestorableSlave:
                 assert reply is not None
                 self._note(reply)
                 return reply
+            if type(self._calls[0]) is Terminate:
+                return Reply([], failure, 0.0)  # the run is complete: nothing is to be restored
             can_be_broken, is_late = (
                 self._can_be_broken(failure),
                 isinstance(failure, DeadlineError),

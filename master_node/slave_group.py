@@ -8,7 +8,7 @@ from time import perf_counter
 
 from master_node.observers import Exchange, ExchangeListener, SlaveStatistics, Statistics
 from master_node.slave_link import SlaveLink
-from protocol.calls import Call, DoStep, Reply
+from protocol.calls import Call, DoStep, Examine, Reply
 from protocol.errors import DoublestepError
 
 Program = tuple[Call, ...]
@@ -139,8 +139,8 @@ class SlaveGroup:
         )
 
     def _located(self, error: DoublestepError, index: int, program: Program) -> DoublestepError:
-        """Name the slave, and the call that a lost request was about: its step, if it has one."""
-        steps = [call.verb for call in program if isinstance(call, DoStep)]
+        """Name the slave, and the call that a lost request was about: its steps, if it has some."""
+        steps = [call.verb for call in program if isinstance(call, DoStep | Examine)]
         return error.located(slave=self.names[index], phase=(steps or [program[0].verb])[0])
 
     def execute_all(self, programs: Sequence[Program], time: float) -> list[Reply]:

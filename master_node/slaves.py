@@ -20,6 +20,7 @@ from master_node.configuration import System
 from master_node.launcher import Launcher, Starter
 from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
+from master_node.request_bounds import RequestBounds
 from master_node.restarts import Restarts
 from master_node.shared_process import Baseline, SharedProcess
 from master_node.slave_link import LocalSlave, SlaveLink
@@ -144,7 +145,13 @@ def slaves_on_bus(
         add_log_fields(run=run)
         announce_run(bus, run, system)
         launcher = stack.enter_context(
-            Launcher(run, _connection(endpoints, private), log_directory, pin=system.bus.pin)
+            Launcher(
+                run,
+                _connection(endpoints, private),
+                log_directory,
+                load_timeout=float(system.bus.load_timeout),
+                pin=system.bus.pin,
+            )
         )
         agents = stack.enter_context(Agents(bus, run, system, uploading))
         starters = (launcher, agents)
@@ -155,7 +162,13 @@ def slaves_on_bus(
         }
         keys |= {name: agents.start(name) for name in system.slaves if name in elsewhere}
         presence = Presence(bus)
-        keys |= presence.wait(found, keys, starters, system.bus.discovery_timeout)
+        keys |= presence.wait(
+            found,
+            keys,
+            starters,
+            discovery_timeout=system.bus.discovery_timeout,
+            load_timeout=system.bus.load_timeout,
+        )
 
         def why_ended(remote: RemoteSlave) -> str:
             died = "its process died" if remote.has_ended else ""
@@ -169,7 +182,7 @@ def slaves_on_bus(
             claim_slave,
             bus,
             run=run,
-            step_timeout=system.bus.step_timeout,
+            bounds=RequestBounds.of(system),
             reconnect_time=system.bus.reconnect_time,
         )
         remotes = stack.enter_context(
@@ -208,7 +221,7 @@ def claim_slave(
     key: SlaveKey,
     *,
     run: str,
-    step_timeout: float,
+    bounds: RequestBounds,
     reconnect_time: float,
     clock: Clock = SYSTEM_CLOCK,
 ) -> RemoteSlave:
@@ -218,7 +231,7 @@ def claim_slave(
         bus: on which it is.
         key: its address.
         run: id of the run.
-        step_timeout: bound on one request [s].
+        bounds: on its requests.
         reconnect_time: how long to wait for one that vanished [s].
         clock: for all waits.
 
@@ -230,7 +243,7 @@ def claim_slave(
             bus,
             key,
             run=run,
-            step_timeout=step_timeout,
+            bounds=bounds,
             reconnect_time=reconnect_time,
             clock=clock,
         )

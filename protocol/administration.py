@@ -19,6 +19,9 @@ from protocol.text_limits import MAX_HOST
 DEFAULT_ORPHAN_TIME: Final = 15.0
 """How long a slave waits for a master that does not say how long [s]."""
 
+DEFAULT_LOAD_TIMEOUT: Final = 120.0
+"""How long a model may take to be loaded, unless it is said otherwise [s]."""
+
 STATUS_BYTES: Final = 4 * 2**20
 """Length of the largest status that is taken, that of an agent with hundreds of slaves."""
 

@@ -12,7 +12,7 @@ from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.administration import MAX_ORPHAN_TIME
+from protocol.administration import DEFAULT_LOAD_TIMEOUT, MAX_ORPHAN_TIME
 from protocol.errors import MalformedMessageError
 from protocol.keys import check_name
 
@@ -196,10 +196,11 @@ class StartSlave:
         requires: labels that the agent must have; a counted licence is taken.
         restart: how often the run has started this slave before. What an agent has started for a
             smaller number is ended.
+        load_timeout: its model may take to be loaded or reset [s].
 
     Raises:
         ConfigurationError: a name is not valid.
-        MalformedMessageError: ``orphan_time`` or ``restart`` is out of range.
+        MalformedMessageError: ``orphan_time``, ``restart`` or ``load_timeout`` is out of range.
     """
 
     run: str
@@ -210,6 +211,7 @@ class StartSlave:
     model: str
     requires: Mapping[str, str]
     restart: int = 0
+    load_timeout: float = DEFAULT_LOAD_TIMEOUT
 
     def __post_init__(self) -> None:
         check_name(self.run, "run id")
@@ -218,6 +220,8 @@ class StartSlave:
             raise MalformedMessageError("restart must not be negative")
         if not 0.0 <= self.orphan_time <= MAX_ORPHAN_TIME:  # NaN is not
             raise MalformedMessageError(f"orphan_time must be from 0 to {MAX_ORPHAN_TIME:g} s")
+        if not 0.0 < self.load_timeout < math.inf:
+            raise MalformedMessageError("load_timeout must be positive")
         for name, value in self.requires.items():
             check_label(name, value)
 

@@ -1011,6 +1011,7 @@ _RECORD_FIELDS: Mapping[type, Mapping[str, _Check]] = {
         "model": _name,
         "requires": _names_by_name,
         "restart": _integer,
+        "load_timeout": _number,
     },
     SlaveStarted: {"instance": _key_part, "pid": _integer},
     StopRun: {"run": _name},

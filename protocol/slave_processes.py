@@ -19,6 +19,7 @@ from typing import Final
 from protocol.endpoints import Endpoints, Mode
 from protocol.errors import (
     ConfigurationError,
+    DeadlineError,
     DoublestepError,
     ModelError,
     SlaveCrashedError,
@@ -46,6 +47,7 @@ class SlaveProcess:
         base: directory to which the model's path is relative.
         key: its address on the bus, where it will appear.
         connection: options of ``slave-node serve`` that lead it to the bus.
+        load_timeout: its model may take to be loaded or reset [s].
         log: file for what it says.
         scratch: existing directory for its temporary files; the caller removes it.
         processor: the only one that it uses; None: any.
@@ -62,6 +64,7 @@ class SlaveProcess:
         key: SlaveKey,
         *,
         connection: Sequence[str],
+        load_timeout: float,
         log: Path,
         scratch: Path,
         processor: int | None = None,
@@ -69,7 +72,7 @@ class SlaveProcess:
     ) -> None:
         command = python_command("-m", "slave_node", "serve")
         command += ["--base", str(base), "--name", key.name, "--instance", key.instance]
-        command += [*connection, "--stay-with-parent"]
+        command += [*connection, "--load-timeout", repr(load_timeout), "--stay-with-parent"]
         if processor is not None:
             command += ["--processor", str(processor)]
         command += ["--", model]  # which may begin with a dash
@@ -163,7 +166,8 @@ def end_error(name: str, exit_code: int, lines: Sequence[str], remedy: str) -> D
 
     Returns:
         A `ModelError` when its model cannot be used, a `SlaveCrashedError` when its model crashed
-        while it was loaded, else a `SlaveLostError`.
+        while it was loaded, a `DeadlineError` when it took too long for that, else a
+        `SlaveLostError`.
     """
     errors = [line for line in lines if line.startswith(_ERROR)]
     words = errors[-1:] or lines[-_SHOWN_LINES:]
@@ -172,6 +176,8 @@ def end_error(name: str, exit_code: int, lines: Sequence[str], remedy: str) -> D
         return ModelError(last, slave=name)
     if exit_code == SlaveCrashedError.exit_code:
         return SlaveCrashedError(last, slave=name, phase="load", remedy=remedy)
+    if exit_code == DeadlineError.exit_code:
+        return DeadlineError(last.removeprefix("load: "), slave=name, phase="load")
     how = describe_exit(exit_code)
     return SlaveLostError(f"its process {how}; its log ends: {last}", slave=name, remedy=remedy)
 

@@ -285,7 +285,7 @@ class Agent:
             end_all([before[1]], at_once=True)
             self._forget(before[1])
         self._check(request)
-        process = self._process(model, base, request.slave, request.run)
+        process = self._process(model, base, request)
         run.slaves[request.slave] = request, process
         self._runs[request.run] = run
         log.info(
@@ -399,9 +399,10 @@ class Agent:
             )
         return self._offer.store.directory, model
 
-    def _process(self, model: str, base: Path, slave: str, run: str) -> SlaveProcess:
+    def _process(self, model: str, base: Path, request: StartSlave) -> SlaveProcess:
         places = self._surroundings
-        key = SlaveKey.of_run(slave, run)
+        slave = request.slave
+        key = SlaveKey.of_run(slave, request.run)
         scratch = places.scratch / key.instance
         log_file = (places.logs or places.scratch) / f"{slave}.{key.instance}.log"
         try:
@@ -409,7 +410,13 @@ class Agent:
         except OSError as error:
             raise ConfigurationError(f"{scratch} cannot be made: {error}") from error
         return SlaveProcess(
-            model, base, key, connection=places.connection, log=log_file, scratch=scratch
+            model,
+            base,
+            key,
+            connection=places.connection,
+            load_timeout=request.load_timeout,
+            log=log_file,
+            scratch=scratch,
         )
 
     def _end_orphans(self, run: str) -> None:

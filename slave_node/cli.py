@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from protocol.administration import STATUS_BYTES
+from protocol.administration import DEFAULT_LOAD_TIMEOUT, STATUS_BYTES
 from protocol.bus import DEFAULT_ENDPOINT
 from protocol.credentials import Credentials, Role
 from protocol.endpoints import LOOPBACK, Endpoints, Mode
@@ -116,6 +116,9 @@ def serve(  # noqa: PLR0917  options of the command line
             "replay or none [default: the best that the model and this host allow]."
         ),
     ] = "",
+    load_timeout: Annotated[
+        float, typer.Option(help="Bound on loading or resetting the model [s].", min=0.0, max=1e6)
+    ] = DEFAULT_LOAD_TIMEOUT,
     base: Annotated[
         Path, typer.Option(help="Directory to which the model's path is relative.")
     ] = Path(),
@@ -149,7 +152,7 @@ def serve(  # noqa: PLR0917  options of the command line
     if processor is not None:
         os.sched_setaffinity(0, {processor})  # type: ignore[attr-defined,unused-ignore]  # Linux
     stack = ExitStack()
-    worker: Worker = WorkerProcess(reference)
+    worker: Worker = WorkerProcess(reference, load_timeout)
     if metrics_port is not None:
         worker = _counting(worker, key.name, stack, metrics_port, metrics_host)
     bus: ZenohBus | None = None
@@ -176,7 +179,7 @@ def serve(  # noqa: PLR0917  options of the command line
         for remark in description.remarks:
             log.warning("%s", remark)
         bus = ZenohBus(endpoints, stop=ending)
-        node = SlaveNode(bus, worker, key, description)
+        node = SlaveNode(bus, worker, key, description, load_timeout=load_timeout)
         if not ending.is_set():
             log.info("%s loaded; on the bus %s", model, _where(endpoints))
             node.serve()

@@ -153,7 +153,7 @@ class Executor:
         self._mode = self._modes[LifeCycleState.FATAL]
         if state is LifeCycleState.FATAL:
             return
-        with suppress(DoublestepError):
+        with suppress(Exception):  # of foreign code; the run has its results
             self._snapshots.clear()
             if state in (LifeCycleState.STEP_COMPLETE, LifeCycleState.STEP_FAILED):
                 self._slave.terminate()

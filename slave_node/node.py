@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 
 from protocol.administration import (
+    DEFAULT_LOAD_TIMEOUT,
     DEFAULT_ORPHAN_TIME,
     Claim,
     Claimed,
@@ -77,6 +78,7 @@ class SlaveNode:
         description: of the slave that ``worker`` holds.
         orphan_time: a slave whose master vanished without release resets itself after this [s],
             unless the master's claim says after how long.
+        load_timeout: a reset that takes longer is ended, and the model is loaded anew [s].
         clock: for its waits and locks.
     """
 
@@ -88,6 +90,7 @@ class SlaveNode:
         description: SlaveDescription,
         orphan_time: float = DEFAULT_ORPHAN_TIME,
         *,
+        load_timeout: float = DEFAULT_LOAD_TIMEOUT,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._bus = bus
@@ -95,6 +98,8 @@ class SlaveNode:
         self._key = key
         self._description = description
         self._orphan_time = orphan_time
+        self._load_timeout = load_timeout
+        self._clock = clock
         self._claims = Claims()
         self._masters = MasterWatch(bus, clock, self._free_orphan)
         self._running = clock.lock()
@@ -195,9 +200,16 @@ class SlaveNode:
         self._revive()
 
     def _reset(self) -> DoublestepError | None:
-        """Reset the slave; why it could not be."""
+        """Reset the slave; why it could not be. One that takes too long is ended."""
         calls = [Reset()]
-        return decode_reply(calls, self._run(encode_program(calls))).error
+        too_late = self._clock.later(
+            self._load_timeout,
+            lambda: self._end_worker(f"no reset within {self._load_timeout:g} s (load_timeout)"),
+        )
+        try:
+            return decode_reply(calls, self._run(encode_program(calls))).error
+        finally:
+            too_late.cancel()
 
     def _claim(self, data: bytes) -> bytes:
         try:

@@ -22,6 +22,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Protocol
 
+from protocol.administration import DEFAULT_LOAD_TIMEOUT
 from protocol.calls import Call, Describe, Initialize
 from protocol.codec import decode_program, decode_reply, encode_error, encode_program, encode_reply
 from protocol.errors import (
@@ -111,12 +112,14 @@ class WorkerProcess:
 
     Args:
         reference: the model.
-        load_time: bound on loading the model [s].
+        load_timeout: bound on loading the model [s].
     """
 
-    def __init__(self, reference: ModelReference, load_time: float = 60.0) -> None:
+    def __init__(
+        self, reference: ModelReference, load_timeout: float = DEFAULT_LOAD_TIMEOUT
+    ) -> None:
         self._reference = reference
-        self._load_time = load_time
+        self._load_timeout = load_timeout
         self._process: BaseProcess | None = None
         self._pipe: Pipe | None = None
         self._guard: threading.Thread | None = None
@@ -154,9 +157,12 @@ class WorkerProcess:
         finally:
             theirs.close()
         try:
-            if not self._pipe.has_message(self._load_time):
+            if not self._pipe.has_message(self._load_timeout):
                 raise DeadlineError(
-                    f"the model was not loaded within {self._load_time:g} s", phase="load"
+                    f"the model was not loaded within {self._load_timeout:g} s",
+                    phase="load",
+                    remedy="if it is only slow, raise load_timeout in [bus], or --load-timeout of "
+                    "slave-node",
                 )
             data = self._pipe.receive()
         except (EOFError, OSError):

@@ -17,6 +17,7 @@ from master_node.configuration import System
 from master_node.observers import Attempt, RunEnd, RunStart
 from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
+from master_node.request_bounds import RequestBounds
 from master_node.slave_group import SlaveGroup
 from master_node.slaves import claim_slave, claimed_slaves, describe
 from master_node.system import resolve
@@ -221,12 +222,18 @@ class _Schedule:
         try:
             bus.announce(alive_master(run))
             presence = Presence(bus, self.clock)
-            keys = presence.wait(list(COUPLINGS), {}, (), DISCOVERY_TIME)
+            keys = presence.wait(
+                list(COUPLINGS),
+                {},
+                (),
+                discovery_timeout=DISCOVERY_TIME,
+                load_timeout=DISCOVERY_TIME,
+            )
             claim = partial(
                 claim_slave,
                 bus,
                 run=run,
-                step_timeout=STEP_TIMEOUT,
+                bounds=RequestBounds(STEP_TIMEOUT, STEP_TIMEOUT, STEP_TIMEOUT),
                 reconnect_time=RECONNECT_TIME,
                 clock=self.clock,
             )

@@ -118,10 +118,9 @@ def test_a_master_that_asks_for_ever_is_found(monkeypatch: pytest.MonkeyPatch) -
     def patient(self: RemoteSlave) -> bytes:
         while True:
             try:
-                return self._execute.request(self._payload)
+                return self._new_caller().request(self._payload)
             except (SlaveLostError, DeadlineError):
                 self._bus.alive("*", 1.0)
-                self._execute = self._caller()
 
     monkeypatch.setattr(RemoteSlave, "_ask_again", patient)
     assert isinstance(find(), TimeIsUpError | BrokenLawError)

@@ -20,6 +20,7 @@ import psutil
 import pytest
 
 from master_node.remote_slave import RemoteSlave
+from master_node.request_bounds import RequestBounds
 from master_node.restorable_slave import RestorableSlave
 from master_node.slaves import describe
 from protocol.administration import MAX_ORPHAN_TIME, Claim
@@ -751,7 +752,9 @@ def test_a_master_whose_slave_was_given_back_takes_it_again(
     Where another run holds the slave meanwhile, that is the end, with its name.
     """
     served = serve()
-    remote = RemoteSlave(served.bus, KEY, run="run-1", step_timeout=BOUND, reconnect_time=1.0)
+    remote = RemoteSlave(
+        served.bus, KEY, run="run-1", bounds=RequestBounds(BOUND, BOUND, BOUND), reconnect_time=1.0
+    )
 
     def restart() -> RemoteSlave:
         remote.renew()

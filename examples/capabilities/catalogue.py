@@ -304,6 +304,7 @@ def lags() -> Iterator[Fmu]:
         ("hangs", "A lag with a step without an end beyond 0.25 s", whole),
         ("not_finite", "A lag whose output is infinite beyond 0.25 s", whole),
         ("changes_process", "A lag that changes the process around it", whole),
+        ("accident", "A lag that meets with an accident where the environment says", whole),
     ):
         yield make_fmu(
             lag_description(name, description),

@@ -93,6 +93,8 @@ typedef struct {
     /* Returns NULL, or why there is no instance. `resources`: folder or URI of the resources. */
     const char *(*open)(void *hidden, const char *resources);
     void (*close)(void *hidden);
+    /* At the begin of a function of FMI between them. Returns NULL, or why it fails. */
+    const char *(*enter)(const char *function);
 
     /* At the end of configuration mode: NULL, or why the structural parameters cannot be so. */
     const char *(*check_structure)(const void *state);

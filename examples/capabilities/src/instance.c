@@ -74,8 +74,14 @@ static const char *mode_name(unsigned mode)
 Instance *enter(void *component, const char *function, unsigned allowed)
 {
     Instance *instance = component;
-    if (!instance || instance->standing.mode & allowed)
-        return instance;
+    if (!instance)
+        return NULL;
+    if (instance->standing.mode & allowed) {
+        const char *reason = behaviour.enter ? behaviour.enter(function) : NULL;
+        if (reason)
+            report(instance, ERROR, function, "%s", reason);
+        return reason ? NULL : instance;
+    }
 
     char modes[160] = "never";
     size_t n = 0;
