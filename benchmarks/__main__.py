@@ -5,6 +5,7 @@ import sys
 from benchmarks import (
     attacks,
     corpus,
+    coupled,
     coverage_guided,
     emulated_inputs,
     fault_points,
@@ -66,6 +67,7 @@ TABLES = {
 CHECKS = {
     "attacks": attacks.main,
     "corpus": corpus.main,
+    "coupled": coupled.main,
     "coverage_guided": coverage_guided.main,
     "fault_points": fault_points.main,
     "fault_schedules": fault_schedules.main,

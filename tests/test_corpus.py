@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import corpus
-from benchmarks.corpus.bounded import Bound, Outcome, adopt_orphans, run_bounded
+from benchmarks.bounded import Bound, Outcome, adopt_orphans, run_bounded
 from benchmarks.corpus.comparison import compare, is_same
 from benchmarks.corpus.experiment import experiment_of
 from benchmarks.corpus.fmpy_loop import regular_rows, scalars

@@ -91,7 +91,7 @@ def polynomial(model: str, order: int) -> np.ndarray:
     return rows[: order + 1, : len(INPUTS[model])] * (15000.0 if model == "chassis_force" else 1.0)
 
 
-END = ((((0.01 + 0.02) + 0.03) + 0.04) + 0.05)
+END = (((0.01 + 0.02) + 0.03) + 0.04) + 0.05
 """The time after `march` from 0 [s], added up as the slave does."""
 
 

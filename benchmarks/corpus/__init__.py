@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.corpus.bounded import adopt_orphans
+from benchmarks.bounded import adopt_orphans
 from benchmarks.corpus.models import CorpusModel, distinct_models
 from benchmarks.corpus.table import COLUMNS, by_tool, coupling_reasons, faults, reasons
 from benchmarks.corpus.trials import Bounds, try_model

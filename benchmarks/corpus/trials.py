@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from benchmarks.corpus.bounded import Bound, Outcome, run_bounded
+from benchmarks.bounded import Bound, Outcome, run_bounded
 from benchmarks.corpus.comparison import compare
 from benchmarks.corpus.experiment import TOLERANCE, experiment_of
 from benchmarks.corpus.models import CorpusModel
@@ -261,7 +261,7 @@ class _Trials:
             return trial
         counted = ("outcome", "communication_steps", "rejected_double_steps", "round_trips")
         numbers = {key: result.summary.get(key) for key in counted}
-        numbers["do_steps"] = result.summary.get("slaves", {}).get(_SLAVE, {}).get("do_steps")
+        numbers["do_steps"] = result.summary.get("do_steps", {}).get(_SLAVE)
         return Trial(trial.end, trial.reason, trial.seconds, trial.warnings, numbers)
 
     def _result(self, name: str) -> Result | None:
