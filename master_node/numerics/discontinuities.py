@@ -17,6 +17,7 @@ seems to lie at T_n itself is looked at with a step of the smallest size at once
 
 from __future__ import annotations
 
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -315,8 +316,8 @@ class Search(NamedTuple):
     def step_size(self, time: float, wanted: float, smallest: float) -> float:
         """H for the next attempt: not more than leads to the middle of the bracket [s].
 
-        After a first step that met no jump, or two later ones, all that is left is tried at once:
-        it may be a false alarm.
+        After a first step that met no jump, or two later ones, all that is left is tried at once,
+        or in equal steps where H is smaller: it may be a false alarm.
 
         Args:
             time: T_n [s].
@@ -327,6 +328,9 @@ class Search(NamedTuple):
             return wanted
         if self.looks_at_point:
             return smallest
-        all_at_once = self.rejected is None and (self.misses >= _MISSES or not self.is_confirmed)
-        half = 2.0 if all_at_once else 4.0
-        return max(smallest, min(wanted, (self.end - time) / half))
+        rest = (self.end - time) / 2.0
+        if self.rejected is None and (self.misses >= _MISSES or not self.is_confirmed):
+            rest /= max(1.0, ceil(rest / wanted))  # no tiny step is left at the end
+        else:
+            rest /= 2.0
+        return max(smallest, min(wanted, rest))
