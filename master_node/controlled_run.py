@@ -325,7 +325,7 @@ class ControlledRun:
         if self._is_smallest(step.times, target):
             if jumps.name and event == jumps.name and jumps.are_answers:
                 return self._leave_to_estimate(position, step, error, jumps)
-            if position.search.is_at_point and not error.norm <= 1.0:
+            if position.search.is_near and not error.norm <= 1.0:
                 event = event or f"{error.limiting_variable} jumps"
             if event:
                 self._statistics.changes_at_smallest_step_size += searched is not None

@@ -220,6 +220,14 @@ class Search(NamedTuple):
         """Nothing is looked for; what false alarms have taught stays."""
         return Search(self.doubts)
 
+    @property
+    def is_near(self) -> bool:
+        """Tell whether a jump is known where ERR > 1 shows one that no defect shows.
+
+        The solutions of a double step may meet a jump at its end in one of them alone.
+        """
+        return self.is_at_point or self.end is not None
+
     def jumps(self, defects: Defects, step_size: float, *, is_accurate: bool) -> Inputs:
         """The inputs that jump in an attempt from T_n, shape (n,).
 
