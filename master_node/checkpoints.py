@@ -44,6 +44,8 @@ _COUNTERS = (
     "late_jumps",
     "changes_at_smallest_step_size",
     "steps_above_tolerance",
+    "iterated_double_steps",
+    "stiff_double_steps",
     "time",
     "smallest_step_size",
     "largest_step_size",

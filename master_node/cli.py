@@ -103,6 +103,10 @@ def run(  # noqa: PLR0917  options of the command line
     sequence: Annotated[
         str | None, typer.Option(help="jacobi: all slaves at once; gauss-seidel: one by one.")
     ] = None,
+    coupling: Annotated[
+        str | None,
+        typer.Option(help="explicit; implicit: iterate each double step; auto: where it is stiff."),
+    ] = None,
     output_interval: Annotated[
         float | None, typer.Option(help="Write results at multiples of this [s].")
     ] = None,
@@ -198,6 +202,7 @@ def run(  # noqa: PLR0917  options of the command line
                 derivative_points=derivative_points,
                 controller=controller,
                 sequence=sequence,
+                coupling=coupling,
                 output_interval=output_interval,
                 estimator=estimator,
                 relative_tolerance=relative_tolerance,

@@ -17,6 +17,7 @@ import numpy as np
 from master_node.checkpoints import NO_CHECKPOINTS, Checkpoints, Resumed
 from master_node.configuration import System
 from master_node.controlled_run import ControlledRun
+from master_node.coupling_run import CouplingRun
 from master_node.coupling_scheme import (
     CouplingScheme,
     output_control,
@@ -28,6 +29,7 @@ from master_node.fixed_run import FixedRun
 from master_node.initialization import initialize
 from master_node.interrupts import Interrupts
 from master_node.mixed_run import MixedRun
+from master_node.numerics.collocation import NODES
 from master_node.numerics.error_estimators import ESTIMATORS
 from master_node.observers import DiscreteType, Observer, Outcome, RunEnd, RunStart, Statistics
 from master_node.outputs import Outputs
@@ -90,7 +92,27 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
                 f"without a step; if they do, say so: [slaves.{part.name}] "
                 "outputs_follow_inputs = true"
             )
-    return warnings + _jumps_off_the_grid(coupled, system)
+    return warnings + _not_iterated(coupled, system) + _jumps_off_the_grid(coupled, system)
+
+
+def _not_iterated(coupled: CoupledSystem, system: System) -> list[str]:
+    """Where ``coupling = "implicit"`` is asked for and cannot be had."""
+    settings = system.simulation
+    if settings.coupling != "implicit" or settings.estimator == "none":
+        return []
+    without = [coupled.parts[slave].name for slave in slaves_without_rollback(coupled)]
+    if without:
+        return [
+            f'coupling = "implicit" needs slaves that can go back, and the state of {without[0]} '
+            "cannot be saved: inputs are extrapolated"
+        ]
+    held = [p.name for p in coupled.parts if p.connected and p.max_order < NODES]
+    if held:
+        return [
+            f'coupling = "implicit" needs inputs that follow a polynomial of degree {NODES}, and '
+            f"those of {held[0]} do not: inputs are extrapolated; leave out input_substeps = 1"
+        ]
+    return []
 
 
 def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:
@@ -111,6 +133,13 @@ def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:
         "has the right mean only, and a discrete input its old value; choose a step size that "
         "meets them, or an estimator"
     ]
+
+
+def coupling(coupled: CoupledSystem, system: System) -> str:
+    """``explicit``, ``implicit`` or ``auto``: as asked for, if all slaves can be iterated."""
+    wanted = system.simulation.coupling
+    orders = [part.max_order for part in coupled.parts if part.connected]
+    return wanted if min(orders, default=0) >= NODES else "explicit"
 
 
 def _discrete_type(type_: VariableType) -> DiscreteType:
@@ -255,7 +284,9 @@ class CoSimulation:
             return DefectRun(context).run(outputs)
         if scheme.late_slaves:
             return MixedRun(context, estimator).run(outputs)
-        return ControlledRun(context, estimator).run(outputs)
+        if self.system.simulation.constants == "paper":
+            return ControlledRun(context, estimator).run(outputs)
+        return CouplingRun(context, estimator, coupling(self.coupled, self.system)).run(outputs)
 
     def _terminate(self, time: float) -> str:
         """Terminate all slaves at the end [s]; the results are complete, whatever they say to it.

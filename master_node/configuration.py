@@ -145,6 +145,7 @@ _PAPER: Mapping[str, Any] = {
     "controller": "elementary",
     "discontinuities": False,
     "initial_history": "rest",
+    "coupling": "explicit",
 }
 """What ``preset = "paper"`` stands for; keys that are given beside it win."""
 
@@ -167,6 +168,8 @@ class SimulationSettings(_Table):
         controller: of the step size: ``pi`` or ``elementary``.
         sequence: ``jacobi``: all slaves take a step at once, with extrapolated inputs;
             ``gauss-seidel``: one after the other, with what the earlier ones have found.
+        coupling: ``explicit``: inputs are extrapolated; ``implicit``: each double step is iterated
+            until its inputs agree with the outputs; ``auto``: that, where the coupling is stiff.
         evaluate_outputs: evaluate outputs with direct feed-through again at each communication
             point, with the inputs that are known there by then.
         discontinuities: find jumps of the coupled variables, step up to them, and cut the history.
@@ -200,6 +203,7 @@ class SimulationSettings(_Table):
     constants: Literal["exact", "paper"] = "exact"
     controller: Literal["pi", "elementary"] = "pi"
     sequence: Literal["jacobi", "gauss-seidel"] = "jacobi"
+    coupling: Literal["auto", "explicit", "implicit"] = "auto"
     evaluate_outputs: StrictBool = False
     discontinuities: StrictBool = True
     events: tuple[Number, ...] = ()

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from master_node.available_polynomials import AvailablePolynomials
+from master_node.coupling_memory import CouplingMemory
 from master_node.double_step import DoubleStep, DoubleStepper
 from master_node.error_control import ErrorControl, StepError
 from master_node.input_defects import InputDefects
@@ -68,6 +69,7 @@ class Position(NamedTuple):
             [s]; None: nowhere.
         crossings: how many more double steps behind an event are kept whatever ERR is, as H is on a
             grid and cannot be made smaller.
+        coupling: explicit or implicit, and what is known of it.
     """
 
     history: CouplingHistory
@@ -81,6 +83,7 @@ class Position(NamedTuple):
     event: float | None = None
     unchanged: float | None = None
     crossings: int = 0
+    coupling: CouplingMemory = CouplingMemory()
 
     @property
     def time(self) -> float:
@@ -276,7 +279,7 @@ class ControlledRun:
                 position = position._replace(history=position.history.without_slopes())
                 continue
             if isinstance(step, DoubleStep):
-                error = self._control.judge(step)
+                error = self._judge(step)
                 if error.norm < _INF:
                     step_size = initial_step_size(
                         y[0],
@@ -312,11 +315,12 @@ class ControlledRun:
         position, polynomials, step = self._attempt(position, times)
         if isinstance(step, FailedStep):
             return self._after_failure(position, step, times, polynomials, target)
-        return self._decide(position, step, target)
+        return self._decide(position, step, self._judge(step), target)
 
-    def _decide(self, position: Position, step: DoubleStep, target: float) -> Position:
+    def _decide(
+        self, position: Position, step: DoubleStep, error: StepError, target: float
+    ) -> Position:
         """Accept a double step towards ``target`` [s], or go back and look for what changed."""
-        error = self._control.judge(step)
         jumps = self._jumps(position, step, error)
         event = self._event(position, step) or jumps.name
         searched = None
@@ -378,6 +382,9 @@ class ControlledRun:
             doubtful.time,
         )
 
+    def _judge(self, step: DoubleStep) -> StepError:
+        return self._control.judge(step)
+
     def _accept(
         self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
     ) -> Position:
@@ -392,26 +399,8 @@ class ControlledRun:
             self._statistics.discontinuities += 1
             self._results.cut(reached[-1])
             return self._behind_event(position, step, history)
-        _, following, controller = self._controller.decide(
-            times.first, error.norm, self._control.exponent(polynomials), position.controller
-        )
-        is_cut_short = self._limits.is_cut_short(times, position.step_size)
-        if is_cut_short:  # by a target or a bracket
-            following = max(following, position.step_size)
-        memory, bound = position.order, self._bound(step, error, defects, history)
+        following, memory, controller = self._next(position, step, error, defects, history)
         is_searching = position.search.end is not None
-        if self._orders is not None and not (is_searching and is_cut_short):
-            memory, factor = self._orders.choose(memory, step, error, history, bound)
-            if factor is not None:
-                factor = min(factor, self._settings.theta_max)
-                if position.controller.rejected:
-                    factor = min(factor, 1.0)
-                following = self._controller.bounded(times.first * factor)
-                controller = NOTHING
-        if bound is not None and memory.polynomial.order:  # constants would ask for any number
-            polynomials = self._available.of(memory.polynomial, history)
-            bounded = min(following, times.first * bound(polynomials))
-            following = self._controller.bounded(bounded)
         search = position.search.passed(times.end)
         if is_searching:
             self._statistics.double_steps_at_discontinuities += 1
@@ -436,6 +425,38 @@ class ControlledRun:
             smooth,
             crossings=max(position.crossings - 1, 0),
         )
+
+    def _next(
+        self,
+        position: Position,
+        step: DoubleStep,
+        error: StepError,
+        defects: Defects | None,
+        history: CouplingHistory,
+    ) -> tuple[float, OrderMemory, ControllerMemory]:
+        """H for the double step that follows an accepted one, with the memories for it."""
+        times, polynomials = step.times, step.polynomials
+        _, following, controller = self._controller.decide(
+            times.first, error.norm, self._control.exponent(polynomials), position.controller
+        )
+        is_cut_short = self._limits.is_cut_short(times, position.step_size)
+        if is_cut_short:  # by a target or a bracket
+            following = max(following, position.step_size)
+        memory, bound = position.order, self._bound(step, error, defects, history)
+        is_searching = position.search.end is not None
+        if self._orders is not None and not (is_searching and is_cut_short):
+            memory, factor = self._orders.choose(memory, step, error, history, bound)
+            if factor is not None:
+                factor = min(factor, self._settings.theta_max)
+                if position.controller.rejected:
+                    factor = min(factor, 1.0)
+                following = self._controller.bounded(times.first * factor)
+                controller = NOTHING
+        if bound is not None and memory.polynomial.order:  # constants would ask for any number
+            polynomials = self._available.of(memory.polynomial, history)
+            bounded = min(following, times.first * bound(polynomials))
+            following = self._controller.bounded(bounded)
+        return following, memory, controller
 
     def _bound(
         self,
@@ -462,9 +483,7 @@ class ControlledRun:
         if self._is_smallest(times, target):
             raise self._stuck(error, times)
         self._tell_rejected(times, step.polynomials, error.norm, error.limiting_variable)
-        _, following, controller = self._controller.decide(
-            times.first, error.norm, self._control.exponent(step.polynomials), position.controller
-        )
+        following, controller = self._smaller(position, step, error)
         kink = self._landing_points.inside(times)
         if kink is not None:  # the double step up to there is smooth
             following = max(following, (kink - times.begin) / 2.0)
@@ -472,6 +491,16 @@ class ControlledRun:
         if defects is not None:
             search = search.after_rejection(times.first, defects)
         return position._replace(step_size=following, controller=controller, search=search)
+
+    def _smaller(
+        self, position: Position, step: DoubleStep, error: StepError
+    ) -> tuple[float, ControllerMemory]:
+        """H after a rejected double step [s]."""
+        exponent = self._control.exponent(step.polynomials)
+        _, following, controller = self._controller.decide(
+            step.times.first, error.norm, exponent, position.controller
+        )
+        return following, controller
 
     def _after_failure(
         self,
@@ -562,7 +591,7 @@ class ControlledRun:
             following = self._after_failure(position, step, times, polynomials, times.end)
             assert isinstance(following, str)  # such a small step is not made smaller
             return following
-        error = self._control.judge(step)
+        error = self._judge(step)
         if not error.norm < _INF:
             raise self._stuck(error, times)
         return self._accept_jump(position, step, error, name)
@@ -733,7 +762,17 @@ class ControlledRun:
         with self._interrupts:
             count_accepted(self._statistics, size, reached)
             self._observer.attempted(
-                Attempt(times.begin, size, order, slopes, error.norm, True, limiting, points)
+                Attempt(
+                    times.begin,
+                    size,
+                    order,
+                    slopes,
+                    error.norm,
+                    True,
+                    limiting,
+                    points,
+                    step.iterations,
+                )
             )
 
     def _tell_searched(self, step: DoubleStep, error: StepError, reason: str) -> None:

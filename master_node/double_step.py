@@ -27,9 +27,11 @@ import numpy as np
 from master_node.coupling_scheme import CouplingScheme
 from master_node.discrete_coupling import DiscreteValues
 from master_node.discrete_step_requests import step_requests
+from master_node.numerics.collocation import Collocation
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import Comparison, ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials, StepInputs
+from master_node.numerics.interface_jacobian import Secants
 from master_node.outputs import NO_OUTPUTS, Outputs
 from master_node.slave_group import SlaveGroup
 from master_node.step_requests import (
@@ -46,7 +48,24 @@ from master_node.step_requests import (
 from master_node.system import CoupledSystem
 from protocol.calls import DoStep, GetOutputs
 from protocol.errors import StepRejectedError
-from protocol.signals import FloatArray
+from protocol.signals import FloatArray, InputSignal
+
+
+class Iteration(NamedTuple):
+    """How the inputs of an iterated double step were found.
+
+    Attributes:
+        collocation: their polynomial.
+        secants: of each slave, for the next iteration.
+        number: of evaluations.
+        loop_gain: spectral radius of the interface Jacobian as far as it is known; infinite where
+            nothing is known of a slave.
+    """
+
+    collocation: Collocation
+    secants: tuple[Secants, ...]
+    number: int
+    loop_gain: float
 
 
 class DoubleStep(NamedTuple):
@@ -63,7 +82,10 @@ class DoubleStep(NamedTuple):
         history: inputs at the communication points up to T_n + H.
         end_inputs: at T_n + 2H, shape (rows, n).
         foreseen: the inputs at T_n + H and T_n + 2H as their polynomials said, shape (n,) each.
+        input_difference: of the comparison solution's inputs from those of the double step, in the
+            mean over the time in which they differ, shape (n,).
         discrete: discrete outputs at T_n + H and T_n + 2H.
+        iteration: how the inputs were found; None: they were extrapolated.
     """
 
     times: DoubleStepTimes
@@ -74,7 +96,14 @@ class DoubleStep(NamedTuple):
     history: CouplingHistory
     end_inputs: FloatArray
     foreseen: tuple[FloatArray, FloatArray]
+    input_difference: FloatArray
     discrete: tuple[DiscreteValues, DiscreteValues] = ((), ())
+    iteration: Iteration | None = None
+
+    @property
+    def iterations(self) -> int:
+        """How many it took to find the inputs; 0: they were extrapolated."""
+        return 0 if self.iteration is None else self.iteration.number
 
 
 class DoubleStepper:
@@ -85,6 +114,9 @@ class DoubleStepper:
         coupled: their connections.
         scheme: how they are coupled within a step.
         estimator: which comparison solution to compute.
+
+    Attributes:
+        requests: to the slaves.
     """
 
     def __init__(
@@ -98,8 +130,8 @@ class DoubleStepper:
         self._external = coupled.external
         self._scheme = scheme
         self._is_long_step = estimator.comparison is Comparison.LONG_STEP
-        self._requests = step_requests(group, coupled, scheme)
-        forms = self._requests.forms
+        self.requests = step_requests(group, coupled, scheme)
+        forms = self.requests.forms
         solution, comparison = scheme.get_outputs, (GetOutputs(),) * len(coupled.parts)
         if scheme.known_ahead:
             comparison = solution
@@ -151,7 +183,7 @@ class DoubleStepper:
 
     def accepted(self) -> None:
         """Go on from the end: the state saved at T_n is not needed any more."""
-        self._requests.forget()
+        self.requests.forget()
 
     def _attempt(
         self,
@@ -168,6 +200,7 @@ class DoubleStepper:
         external_long = self._external.over(begin, end)
         in_first: StepInputs
         in_second: StepInputs
+        in_long: StepInputs
 
         def first_inputs(known: FloatArray) -> FloatArray:
             nonlocal in_first
@@ -182,8 +215,14 @@ class DoubleStepper:
         small_piece = Piece(first_inputs, external, held, DoStep(begin, first, True))
         if self._is_long_step:
             past, size = history.every_second(), times.long
+
+            def long_inputs(known: FloatArray) -> FloatArray:
+                nonlocal in_long
+                in_long = self._inputs(past, polynomials, (begin, end), size, known)
+                return in_long.begin
+
             comparison_piece = Piece(
-                lambda known: self._inputs(past, polynomials, (begin, end), size, known).begin,
+                long_inputs,
                 external_long,
                 held,
                 DoStep(begin, size, True),
@@ -212,7 +251,13 @@ class DoubleStepper:
         if self._is_careful:
             (at_end,) = self._carefully(self._careful_second_request, second_piece)
         else:
-            (at_end,) = self._requests.take(self._second_request, (second_piece,))
+            (at_end,) = self.requests.take(self._second_request, (second_piece,))
+        mean_second = InputSignal(in_second.begin).mean(second)
+        if self._is_long_step:
+            mean_first = InputSignal(in_first.begin).mean(first)
+            difference = InputSignal(in_long.begin).mean(size) - 0.5 * (mean_first + mean_second)
+        else:
+            difference = InputSignal(in_first.end).mean(second) - mean_second
         return DoubleStep(
             times,
             polynomials,
@@ -222,24 +267,25 @@ class DoubleStepper:
             pushed,
             self._coupled.inputs_of(at_end.y),
             (in_first.end[0], in_second.end[0]),
+            difference,
             (d_middle, discrete.filled(at_end.d, d_middle)),
         )
 
     def _first_steps(self, first: Piece, second: Piece) -> list[Outputs]:
         """All that depends only on what is known at T_n."""
         if not self._is_careful:
-            return self._requests.take(self._first_request, (first, second))
+            return self.requests.take(self._first_request, (first, second))
         pairs = zip(self._careful_first_requests, (first, second), strict=True)
         return [outputs for form, piece in pairs for outputs in self._carefully([form], piece)]
 
     def _carefully(self, forms: Sequence[RequestForm], piece: Piece) -> list[Outputs]:
         """A step by itself; once more if a slave returns early in it right behind a restore."""
         try:
-            return self._requests.take(forms, (piece,))
+            return self.requests.take(forms, (piece,))
         except BrokenOffError as broken_off:
             if not broken_off.failed.has_doubtful_event:
                 raise
-        return self._requests.take(forms, (piece,))
+        return self.requests.take(forms, (piece,))
 
     def _without_derivative(self, middle: FloatArray) -> FailedStep:
         """The second small step cannot have the polynomials of the first one."""

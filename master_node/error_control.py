@@ -42,6 +42,8 @@ class StepError(NamedTuple):
         scale: ATOL_j + RTOL_j |y_j| of equation (8), shape (m,), unit [y].
         norm: ERR of equation (8); inf when a value is not finite.
         limiting_variable: ``slave.variable`` with the largest part in ERR.
+        loop_gain: spectral radius of the interface Jacobian as far as the double step tells it; 0
+            where it is not looked at.
     """
 
     difference: FloatArray
@@ -49,6 +51,7 @@ class StepError(NamedTuple):
     scale: FloatArray
     norm: float
     limiting_variable: str
+    loop_gain: float = 0.0
 
     @property
     def estimate(self) -> FloatArray:

@@ -105,6 +105,7 @@ class Attempt(NamedTuple):
             is no ERR; "" when there is no estimator.
         points: where results are wanted, in (T_n, T_n + 2H], and y there, shape (m,) each: the
             communication points reached, or those of an output grid; empty when rejected.
+        iterations: of the inputs at the end of the double step; 0: they were extrapolated.
     """
 
     time: float
@@ -115,6 +116,7 @@ class Attempt(NamedTuple):
     accepted: bool
     limiting_variable: str
     points: Points = ()
+    iterations: int = 0
 
 
 class Outcome(StrEnum):
@@ -184,6 +186,9 @@ class Statistics:
         steps_above_tolerance: double steps, or single ones where no slave has rollback, that had
             ERR above 1 when it was too late to reject them, or behind an event on a grid of steps,
             where H could not be smaller.
+        iterated_double_steps: accepted ones whose inputs were iterated.
+        stiff_double_steps: accepted explicit ones with a loop gain above 1, of which the estimate
+            is uncertain.
         time: the last accepted communication point [s].
         smallest_step_size, largest_step_size: over accepted steps [s]; NaN before the first.
     """
@@ -196,6 +201,8 @@ class Statistics:
     late_jumps: int = 0
     changes_at_smallest_step_size: int = 0
     steps_above_tolerance: int = 0
+    iterated_double_steps: int = 0
+    stiff_double_steps: int = 0
     round_trips: int = 0
     wait_time: float = 0.0
     wall_time: float = 0.0

@@ -14,6 +14,10 @@ _SHARE_OF_JUMPS, _SHARE_OF_FALSE_ALARMS = 0.5, 0.1
 """Shares of all double steps that go to jumps, and to false alarms, without a warning."""
 
 
+_SHARE_OF_STIFF_STEPS = 0.05
+"""Of all double steps that may be explicit where the coupling is stiff."""
+
+
 def warnings_of(statistics: Statistics) -> list[str]:
     """One sentence for each, with its remedy."""
     warnings = []
@@ -42,6 +46,14 @@ def warnings_of(statistics: Statistics) -> list[str]:
             "showed it; 'jumps late' in the column limiting_variable of steps.csv says where; use "
             'order = "auto", or lower largest_step_size or the tolerances of the outputs that '
             "these slaves get"
+        )
+    stiff = statistics.stiff_double_steps
+    if stiff > _SHARE_OF_STIFF_STEPS * statistics.communication_steps / 2:
+        warnings.append(
+            f"{stiff} of {statistics.communication_steps // 2} double steps had a loop gain above "
+            "1: the coupling is stiff, and the estimate of an extrapolated step tells little "
+            'there; use coupling = "auto" with slaves whose states can be saved and whose inputs '
+            "follow input derivatives or substeps, or check against a run with lower tolerances"
         )
     if statistics.changes_at_smallest_step_size:
         warnings.append(

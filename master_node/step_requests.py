@@ -177,10 +177,11 @@ class StepRequests:
     def forms(self, *steps: StepForm) -> list[RequestForm]:
         """The requests that take these steps: one, unless outputs are evaluated in between."""
         if self._evaluation.is_needed:
-            return [self._form((step,)) for step in steps]
-        return [self._form(steps)]
+            return [self.form((step,)) for step in steps]
+        return [self.form(steps)]
 
-    def _form(self, steps: tuple[StepForm, ...]) -> RequestForm:
+    def form(self, steps: tuple[StepForm, ...]) -> RequestForm:
+        """One request that takes all of these steps."""
         places = self._places(steps)
         rows = {get.order + 1 for step in steps for get in step.get_outputs}
         is_even = self._scheme.groups == (tuple(self._slaves),) and rows == {len(self._unknown)}
@@ -207,10 +208,10 @@ class StepRequests:
             BrokenOffError: a slave did not get to the end, or an output there is not finite.
         """
         if not self._evaluation.is_needed:
-            return self._request(forms[0], pieces)
+            return self.request(forms[0], pieces)
         found = []
         for form, piece in zip(forms, pieces, strict=True):
-            (outputs,) = self._request(form, [piece])
+            (outputs,) = self.request(form, [piece])
             step = piece.step
             try:
                 self._evaluation.evaluate(
@@ -223,8 +224,11 @@ class StepRequests:
             found.append(outputs)
         return found
 
-    def _request(self, form: RequestForm, pieces: Sequence[Piece]) -> list[Outputs]:
-        """One request to each slave, group after group."""
+    def request(self, form: RequestForm, pieces: Sequence[Piece]) -> list[Outputs]:
+        """One request to each slave, group after group; no outputs are evaluated in between.
+
+        Arguments, result and errors as for `take`.
+        """
         if form.outputs:
             return self._request_at_once(form, pieces)
         places = form.places

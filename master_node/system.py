@@ -192,6 +192,11 @@ class CoupledSystem:
         """Tolerances of outputs, shape (m,), infinite for those that do not count in ERR."""
         return np.where(self.is_controlled, scale, np.inf)
 
+    def changes_of_inputs(self, changes: FloatArray) -> FloatArray:
+        """Changes of inputs, shape (..., n), that belong to those of outputs, shape (..., m)."""
+        u: FloatArray = changes.take(self.source, axis=-1)
+        return u * self.factor if self._transforms else u
+
     def scale_of_inputs(self, scale: FloatArray) -> FloatArray:
         """Tolerances of inputs, shape (n,), unit [u], from those of outputs, (m,), unit [y]."""
         taken: FloatArray = scale.take(self.source)

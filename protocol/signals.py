@@ -36,6 +36,13 @@ class InputSignal:
             value = self.derivatives[j - 1] + value * (offset / j)
         return value
 
+    def mean(self, span: float) -> FloatArray:
+        """Mean of u from T to T + span, shape (n_u,)."""
+        value: FloatArray = self.derivatives[-1] / (self.order + 1)
+        for j in range(self.order, 0, -1):
+            value = self.derivatives[j - 1] / j + value * (span / j)
+        return value
+
     def shifted(self, offset: float) -> InputSignal:
         """The same polynomial around T + offset."""
         d = self.derivatives

@@ -36,7 +36,8 @@ def test_a_double_step_costs_two_round_trips_for_each_slave(
 ) -> None:
     """Each slave still gets two requests; they follow each other."""
     system = load_system(OSCILLATORS / f"{name}.toml")
-    options = {"initial_step_size": 1e-2, "estimator": estimator, **SEQUENCE}
+    options = {"initial_step_size": 1e-2, "estimator": estimator, "coupling": "explicit"}
+    options |= SEQUENCE
     summary = simulate(system, in_process=True, stop_time=2.0, **options).summary
     attempts = summary["communication_steps"] // 2 + summary["rejected_double_steps"]
     slaves = len(system.slaves)

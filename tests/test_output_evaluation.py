@@ -193,7 +193,7 @@ def test_a_loop_that_is_not_evaluated_is_named_where_no_step_is_small_enough() -
     """Errors grow round it whatever H is, so the tolerances alone are no remedy. Where the loop is
     evaluated it is not named.
     """
-    run = run_slaves(loop(2.0, -3.0, evaluate_outputs=False))
+    run = run_slaves(loop(2.0, -3.0, evaluate_outputs=False, coupling="explicit"))
     assert isinstance(run.error, StepSizeError)
     assert "a.y -> b.y" in run.error.remedy
     assert "evaluate_outputs" in run.error.remedy

@@ -19,6 +19,7 @@ PAPER: dict[str, Any] = {
     "controller": "elementary",
     "discontinuities": False,
     "initial_history": "rest",
+    "coupling": "explicit",
 }
 """What it stands for, key by key."""
 
@@ -28,6 +29,7 @@ OTHERS: dict[str, Any] = {
     "controller": "pi",
     "discontinuities": True,
     "initial_history": "none",
+    "coupling": "auto",
 }
 """Another value for each key that can have one beside it."""
 

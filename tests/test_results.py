@@ -145,10 +145,10 @@ def test_rejected_attempts_are_steps_but_no_results(tmp_path: Path) -> None:
     """A rejected attempt leaves a line in steps.csv and no trace in results.csv."""
     write(tmp_path)
     assert (tmp_path / "steps.csv").read_text().splitlines() == [
-        "time,step_size,order,derivative_points,error_norm,accepted,limiting_variable",
-        "0.0,0.5,3,1,7.5,false,chassis.x",
-        "0.0,0.25,3,1,0.25,true,wheel.v",
-        "0.5,0.125,3,1,0.25,true,wheel.v",
+        "time,step_size,order,derivative_points,iterations,error_norm,accepted,limiting_variable",
+        "0.0,0.5,3,1,0,7.5,false,chassis.x",
+        "0.0,0.25,3,1,0,0.25,true,wheel.v",
+        "0.5,0.125,3,1,0,0.25,true,wheel.v",
     ]
     without = write(tmp_path / "without", [a for a in ATTEMPTS if a.accepted])
     assert (tmp_path / "results.csv").read_bytes() == (without / "results.csv").read_bytes()
@@ -572,7 +572,7 @@ def put(directory: Path, lines: Sequence[str], name: str = "results.csv") -> Pat
 def test_unfinished_last_line_is_left_out(tmp_path: Path) -> None:
     """Without its line break a last number may be cut: 0.12 of 0.125 is no result."""
     put(tmp_path, ["time,a.x", "0.0,1.0", "0.5,0.12"])
-    put(tmp_path, [",".join(STEPS_DTYPE.names), "0.0,0.5,1,0,0.1,tr"], "steps.csv")
+    put(tmp_path, [",".join(STEPS_DTYPE.names), "0.0,0.5,1,0,0,0.1,tr"], "steps.csv")
     result = Result.load(tmp_path)
     assert result.time.tolist() == [0.0]
     assert len(result.steps) == 0
@@ -611,7 +611,7 @@ def test_malformed_results_name_file_and_line(
     ("name", "lines", "message"),
     [
         ("steps.csv", ["time,H", ""], r"steps\.csv, line 1: the columns must be time,step_size"),
-        ("steps.csv", [None, "0.0,0.1,1,0,0.5,maybe,x", ""], r"steps\.csv, line 2: .*maybe"),
+        ("steps.csv", [None, "0.0,0.1,1,0,0,0.5,maybe,x", ""], r"steps\.csv, line 2: .*maybe"),
         ("steps.csv", [None, "0.0,0.1", ""], r"steps\.csv, line 2: expected an attempted step"),
         ("summary.json", ["{", '"a": nope', "}"], r"summary\.json, line 2: Expecting value"),
         ("summary.json", ["[]"], r"summary\.json, line 1: expected a JSON object"),

@@ -16,8 +16,9 @@ class DoubleStepTimes(NamedTuple):
 
     Attributes:
         begin, middle, end: communication points [s].
-        first, second: sizes of the small steps [s]; both are H but for the rounding of the times.
-        step_size: H [s].
+        first, second: sizes of the small steps [s]; both are H but for the rounding of the times,
+            unless the middle was moved (`with_middle`).
+        step_size: H [s]: half of the double step.
     """
 
     begin: float
@@ -51,6 +52,11 @@ class DoubleStepTimes(NamedTuple):
         middle = begin + first
         second = step_to(middle, end, step_size, largest)
         return DoubleStepTimes(begin, middle, middle + second, first, second, step_size)
+
+    def with_middle(self, part: float) -> DoubleStepTimes:
+        """The same with the middle at ``part`` of the way, 0 to 1."""
+        middle = self.begin + part * (self.end - self.begin)
+        return DoubleStepTimes.through(self.begin, middle, self.end, self.step_size)
 
     @property
     def long(self) -> float:

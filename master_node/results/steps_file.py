@@ -20,6 +20,7 @@ STEPS_DTYPE = np.dtype(
         ("step_size", np.float64),
         ("order", np.int64),
         ("derivative_points", np.int64),
+        ("iterations", np.int64),
         ("error_norm", np.float64),
         ("accepted", np.bool_),
         ("limiting_variable", np.object_),
@@ -48,14 +49,14 @@ class StepsFile(LineFile):
         name = attempt.limiting_variable
         self._add(
             f"{float(attempt.time)!r},{float(attempt.step_size)!r},{attempt.order:d},"
-            f"{attempt.derivative_points:d},"
+            f"{attempt.derivative_points:d},{attempt.iterations:d},"
             f"{float(attempt.error_norm)!r},{'true' if attempt.accepted else 'false'},"
             f"{self._quoted.get(name) or one_field(name)}\n"
         )
 
 
 class Steps:
-    """Attempts in growing arrays; 48 bytes each, whatever the text."""
+    """Attempts in growing arrays; 56 bytes each, whatever the text."""
 
     def __init__(self) -> None:
         self._numbers = array("d")
@@ -66,7 +67,15 @@ class Steps:
         """Note one attempt, but for its points."""
         a = attempt
         self._numbers.extend(
-            (a.time, a.step_size, a.order, a.derivative_points, a.error_norm, a.accepted)
+            (
+                a.time,
+                a.step_size,
+                a.order,
+                a.derivative_points,
+                a.iterations,
+                a.error_norm,
+                a.accepted,
+            )
         )
         self._texts.append(self._known.setdefault(a.limiting_variable, a.limiting_variable))
 
@@ -95,7 +104,7 @@ def read_steps(path: Path) -> Steps:
                 raise malformed(path, f"the columns must be {','.join(_COLUMNS)}", 1)
             for row in reader:
                 try:
-                    time, step_size, order, points, error_norm, accepted, text = row
+                    time, step_size, order, points, iterations, error_norm, accepted, text = row
                     attempt = Attempt(
                         float(time),
                         float(step_size),
@@ -104,6 +113,7 @@ def read_steps(path: Path) -> Steps:
                         float(error_norm),
                         flags[accepted],
                         text,
+                        iterations=int(iterations),
                     )
                 except (ValueError, KeyError):
                     what = f"expected an attempted step, found {','.join(row)[:80]!r}"

@@ -44,6 +44,8 @@ def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> d
             "late_jumps": statistics.late_jumps,
             "changes_at_smallest_step_size": statistics.changes_at_smallest_step_size,
             "steps_above_tolerance": statistics.steps_above_tolerance,
+            "iterated_double_steps": statistics.iterated_double_steps,
+            "stiff_double_steps": statistics.stiff_double_steps,
             "warnings": warnings_of(statistics),
             "controlled_by": start.control._asdict(),
             "state_kind": start.state_kinds,

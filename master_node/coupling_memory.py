@@ -1,0 +1,129 @@
+"""When a system is coupled implicitly: what is remembered of it, and how it is decided.
+
+The loop gain is the factor by which an error of the inputs comes back to them after one sweep
+through all slaves. An explicit double step is such a sweep: its error is what its estimate says
+while the gain is small, and larger by 1 / (1 - gain) where an error comes back with its own sign.
+Near 1 its estimate is blind, and beyond it is unstable (docs/numerics.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from master_node.numerics.collocation import NODES
+from master_node.numerics.interface_jacobian import Interface, InterfaceJacobian, Secants
+from protocol.signals import FloatArray
+
+STIFF = 0.6
+"""Loop gain that is not borne for long. Explicit double steps lose their stability there, as the
+differences that tell the gain are larger at the end of the step than in its mean."""
+
+BLIND = 1.0
+"""Loop gain from which on the estimate of an explicit double step is enlarged to what the loop
+makes of it."""
+
+CALM = 0.1
+"""Loop gain up to which explicit double steps take over again."""
+
+_PATIENCE = 3
+"""Explicit double steps in a row with a large loop gain before iterated ones are tried."""
+
+_CALM_IN_A_ROW = 2
+"""Iterated double steps in a row with a small one before explicit ones take over."""
+
+_POOR_IN_A_ROW = 6
+"""Iterated double steps in a row that lead less far for their do_steps than explicit ones did."""
+
+_EXPLICIT_DO_STEPS = 3
+"""That an explicit double step costs."""
+
+_MOST_PATIENCE = 24
+"""Of them at most: as often as iterated ones were not worth it, it is doubled."""
+
+_SMALLEST_DIFFERENCE = 1e-5
+"""Difference of the inputs, in units of their tolerances, below which outputs tell nothing."""
+
+
+class CouplingMemory(NamedTuple):
+    """What a run remembers of its coupling.
+
+    Attributes:
+        is_implicit: whether double steps are iterated.
+        secants: of each slave; empty before the first iteration.
+        in_a_row: double steps in a row for which the other way speaks.
+        patience: explicit double steps in a row with a large loop gain that are borne.
+        explicit_step_size: H of the last explicit double step that was accepted [s].
+        poor: iterated double steps in a row that led less far for their do_steps than that.
+    """
+
+    is_implicit: bool = False
+    secants: tuple[Secants, ...] = ()
+    in_a_row: int = 0
+    patience: int = _PATIENCE
+    explicit_step_size: float = 0.0
+    poor: int = 0
+
+    def noted(self, loop_gain: float) -> CouplingMemory:
+        """With the loop gain that an explicit double step tells, accepted or not."""
+        return self._replace(in_a_row=self.in_a_row + 1 if loop_gain >= STIFF else 0)
+
+    @property
+    def asks_for_iteration(self) -> bool:
+        """Whether iterated double steps are to be tried."""
+        return not self.is_implicit and self.in_a_row >= self.patience
+
+    def iterating(self, secants: tuple[Secants, ...]) -> CouplingMemory:
+        """When iterated double steps begin, with what is known of each slave."""
+        return self._replace(is_implicit=True, secants=secants, in_a_row=0)
+
+    def extrapolating(self, patience: int) -> CouplingMemory:
+        """When explicit double steps take over."""
+        return CouplingMemory(
+            patience=min(patience, _MOST_PATIENCE), explicit_step_size=self.explicit_step_size
+        )
+
+    def after_iterated(
+        self, secants: tuple[Secants, ...], iterations: int, step_size: float, loop_gain: float
+    ) -> CouplingMemory:
+        """After an iterated double step was accepted.
+
+        Args:
+            secants: that are known by then.
+            iterations: that it took.
+            step_size: H [s].
+            loop_gain: that it had; infinite where it is not known.
+        """
+        calm = self.in_a_row + 1 if loop_gain <= CALM else 0
+        if calm >= _CALM_IN_A_ROW:
+            return self.extrapolating(_PATIENCE)
+        is_poor = step_size * _EXPLICIT_DO_STEPS < self.explicit_step_size * NODES * iterations
+        poor = self.poor + 1 if is_poor else 0
+        if poor >= _POOR_IN_A_ROW:
+            return self.extrapolating(2 * self.patience)
+        return self._replace(secants=secants, in_a_row=calm, poor=poor)
+
+
+def explicit_jacobian(
+    interface: Interface, inputs: FloatArray, outputs: FloatArray, scale: FloatArray
+) -> InterfaceJacobian:
+    """What the two solutions of an explicit double step tell of the interface Jacobian.
+
+    Each slave has answered to two inputs from the same state: one secant, that of the direction in
+    which the extrapolation errs.
+
+    Args:
+        interface: which inputs and outputs belong to which slave.
+        inputs: difference of the inputs at the end, shape (n,), unit [u].
+        outputs: difference of the outputs there, shape (m,), unit [y].
+        scale: tolerances of the inputs, shape (n,), unit [u].
+    """
+    secants: Sequence[Secants] = [
+        Secants((inputs[columns],), (outputs[rows],))
+        if np.abs(inputs[columns] / scale[columns]).max(initial=0.0) > _SMALLEST_DIFFERENCE
+        else Secants()
+        for columns, rows in zip(interface.input_slices, interface.output_slices, strict=True)
+    ]
+    return InterfaceJacobian(secants, interface, scale[np.newaxis])
