@@ -661,7 +661,7 @@ class ControlledRun:
 
     def _jumps(self, position: Position, step: DoubleStep, error: StepError) -> _Jumps:
         """The inputs that jump in a double step, as far as defects tell."""
-        if not self._settings.discontinuities:
+        if not self._settings.discontinuities or self._begins_from_rest(position):
             return _Jumps()
         search, smooth = position.search, position.smooth
         defects = self._defects.of(step, error.scale, position.history, smooth)
@@ -675,6 +675,11 @@ class ControlledRun:
             are_answers=self._defects.are_answers(defects, inputs, smooth),
             are_late=self._defects.are_late(inputs, smooth),
         )
+
+    def _begins_from_rest(self, position: Position) -> bool:
+        """Whether the past is made up, so that no defect tells a jump from the first motion."""
+        times = position.history.times
+        return len(times) > 1 and times[1] < self._start
 
     def _go_on_searching(
         self,
