@@ -255,11 +255,15 @@ def test_false_alarms_teach_and_jumps_are_believed_again() -> None:
 
 
 def test_a_search_keeps_to_the_inputs_that_it_began_with() -> None:
-    """A defect of another input does not mislead it, nor a part of the jump's size."""
+    """A defect of another input does not mislead it, nor a small part of the jump's size.
+
+    A larger part is met: several jumps of an input may lie in one bracket.
+    """
     times = DoubleStepTimes.from_step_size(0.0, 1.0)
     search = Search.nothing(2).found(times, defects(0.0, 100.0), np.array([True, False]), 1e-9)
     assert jumps(search, defects(0.0, 100.0, beside=1e6))
-    assert not jumps(search, defects(0.0, 40.0, beside=1e6))
+    assert jumps(search, defects(0.0, 40.0, beside=1e6))
+    assert not jumps(search, defects(0.0, 9.0, beside=1e6))
 
 
 @given(st.floats(0.0, 1.0), st.floats(1e-6, 1.0))

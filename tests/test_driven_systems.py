@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from hypothesis import Phase, assume, given, settings
+from hypothesis import Phase, example, assume, given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System
@@ -170,6 +170,8 @@ def test_a_jump_is_found_wherever_it_is(
 
 
 @settings(max_examples=15, phases=WITHOUT_SHRINKING)
+@example([1.6804408697559372, 1.7175634198155068])
+@example([0.11253358143414634, 2.0333014966714726, 2.0, 0.4394135589371576])
 @given(
     st.lists(st.floats(0.1, 2.9), min_size=1, max_size=4, unique=True).filter(
         lambda times: np.diff([0.0, *sorted(times)]).min() > 0.01

@@ -35,6 +35,10 @@ _MUCH_SMALLER = 0.25
 _PART = 0.5
 """Of a change that was foreseen: a smaller defect is one of a smooth input."""
 
+_SHARE = 0.1
+"""Of the jump that is looked for: a smaller one beside it is not met, a larger one is, as several of
+an input may lie in one bracket."""
+
 _SURPRISE, _TWICE = 10.0, 2.0
 """How many times larger than expected, and than the change that was foreseen, a defect is that only
 a jump explains."""
@@ -243,7 +247,8 @@ class Search(NamedTuple):
                 jumping |= defects.jumps_in_middle(self.doubts)
         if self.sizes is not None:
             stay = (defects.sizes > _PART * self.sizes) & defects.like_jumps
-            jumping = np.where(np.isfinite(self.sizes), stay, jumping)
+            jumping &= ~np.isfinite(self.sizes) | (defects.sizes > _SHARE * self.sizes)
+            jumping |= np.isfinite(self.sizes) & stay
         elif self.rejected is not None and self._is_much_smaller(step_size):
             stay = (defects.sizes > _PART * self.rejected[1]) & (not self.is_at_point)
             jumping |= stay & defects.like_jumps
