@@ -36,8 +36,8 @@ _PART = 0.5
 """Of a change that was foreseen: a smaller defect is one of a smooth input."""
 
 _SHARE = 0.1
-"""Of the jump that is looked for: a smaller one beside it is not met, a larger one is, as several of
-an input may lie in one bracket."""
+"""Of the jump that is looked for: a smaller one beside it is not met. A larger one is, as several
+jumps of an input may lie in one bracket."""
 
 _SURPRISE, _TWICE = 10.0, 2.0
 """How many times larger than expected, and than the change that was foreseen, a defect is that only
