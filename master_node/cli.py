@@ -114,6 +114,10 @@ def run(  # noqa: PLR0917  options of the command line
         list[str] | None,
         typer.Option(help="Pattern for slave.variable; !PATTERN leaves out; may be repeated."),
     ] = None,
+    output_locals: Annotated[
+        list[str] | None,
+        typer.Option(help="The same for variables that are no outputs; may be repeated."),
+    ] = None,
     output_every: Annotated[
         int | None, typer.Option(help="Keep each N-th result point, the first and the last.")
     ] = None,
@@ -224,6 +228,7 @@ def run(  # noqa: PLR0917  options of the command line
             )
             .with_results(
                 variables=tuple(output_variables or ()),
+                locals=tuple(output_locals or ()),
                 every=output_every,
                 formats=tuple(output_format or ()),
             )

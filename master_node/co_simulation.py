@@ -142,6 +142,16 @@ def coupling(coupled: CoupledSystem, system: System) -> str:
     return wanted if min(orders, default=0) >= NODES else "explicit"
 
 
+def enumerations(coupled: CoupledSystem) -> dict[str, Mapping[str, int]]:
+    """The items of all enumerations among the results, by ``slave.variable``."""
+    recorded = (one for one in coupled.recorded.discrete)
+    found = {one.name: one.variable.items for one in recorded}
+    for part in coupled.parts:
+        items = {v.name: v.items for v in part.description.variables if v.items}
+        found |= {f"{part.name}.{n}": items[n] for n in part.discrete_outputs if n in items}
+    return {name: items for name, items in found.items() if items}
+
+
 def _discrete_type(type_: VariableType) -> DiscreteType:
     """What results hold for a variable of this type."""
     if type_.is_real:
@@ -202,22 +212,7 @@ class CoSimulation:
             self.checkpoints.restore(self.resumed)
             self.group.continue_statistics(self.resumed.statistics)
             statistics = replace(self.resumed.statistics, slaves=self.group.statistics)
-        self.observer.started(
-            RunStart(
-                self.coupled.output_names,
-                self.coupled.output_units,
-                float(settings.start_time),
-                settings.end,
-                outputs.y[0],
-                self.coupled.discrete.names,
-                tuple(map(_discrete_type, self.coupled.discrete.types)),
-                self.coupled.discrete.units,
-                outputs.d,
-                output_control(self.coupled, self.system),
-                {part.name: part.description.state_kind for part in self.coupled.parts},
-                self.group.statistics,
-            )
-        )
+        self.observer.started(self._start(outputs))
         begin = perf_counter() - statistics.wall_time
 
         def update() -> None:
@@ -257,6 +252,31 @@ class CoSimulation:
             self.observer.ended(RunEnd(outcome, statistics, message))
         self.checkpoints.remove()
         return statistics
+
+    def _start(self, outputs: Outputs) -> RunStart:
+        """What observers are told first."""
+        coupled, settings = self.coupled, self.system.simulation
+        discrete, recorded = coupled.discrete, coupled.recorded
+        y, d = recorded.split(outputs.y, outputs.d)
+        return RunStart(
+            (*coupled.output_names, *(one.name for one in recorded.continuous)),
+            (*coupled.output_units, *(one.variable.unit for one in recorded.continuous)),
+            float(settings.start_time),
+            settings.end,
+            y[0],
+            (*discrete.names, *(one.name for one in recorded.discrete)),
+            (
+                *map(_discrete_type, discrete.types),
+                *(_discrete_type(one.variable.type) for one in recorded.discrete),
+            ),
+            (*discrete.units, *(one.variable.unit for one in recorded.discrete)),
+            d,
+            frozenset(one.name for one in (*recorded.continuous, *recorded.discrete)),
+            enumerations(coupled),
+            output_control(coupled, self.system),
+            {part.name: part.description.state_kind for part in coupled.parts},
+            self.group.statistics,
+        )
 
     def _steps(
         self,

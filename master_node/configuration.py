@@ -637,12 +637,15 @@ class ResultsSettings(_Table):
     """The ``[results]`` table.
 
     Attributes:
-        variables: patterns for ``slave.variable``; those that begin with ``!`` leave out.
+        variables: patterns for ``slave.variable`` of outputs; those that begin with ``!`` leave
+            out. One without a wildcard may name any variable.
+        locals: the same for variables that are no outputs: locals, parameters and inputs.
         every: of the points after the first each ``every``-th is a result, and the last.
         formats: of the result files.
     """
 
     variables: Annotated[tuple[Pattern, ...], AfterValidator(_not_empty)] = ("*",)
+    locals: tuple[Pattern, ...] = ()
     every: Annotated[StrictInt, Field(ge=1)] = 1
     formats: Annotated[tuple[Format, ...], AfterValidator(_not_empty)] = ("csv",)
 

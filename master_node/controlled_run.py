@@ -158,7 +158,7 @@ class ControlledRun:
             grows_after_rejection=settings.controller == "elementary",
         )
         self._orders = None
-        if settings.order == "auto":
+        if settings.order == "auto" and coupled.output_names:
             self._orders = self._make_orders(context)
 
     def _make_stepper(self, context: RunContext, estimator: ErrorEstimator) -> DoubleStepper:

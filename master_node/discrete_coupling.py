@@ -20,7 +20,8 @@ from protocol.signals import FloatArray
 from protocol.slave import Causality, SlaveDescription, StartValue, VariableType
 
 DiscreteValues = tuple[StartValue, ...]
-"""Values of the discrete outputs; None stands for one that was not read."""
+"""Values of the discrete outputs, then of the recorded variables; None stands for one that was not
+read."""
 
 Held = tuple[DiscreteValues, ...]
 """For each slave the values of its discrete inputs; empty where no slave has any."""
@@ -161,8 +162,8 @@ class DiscreteCoupling:
         return tuple(tuple(one.signal.at(time) for one in each) for each in self.driven)
 
     def filled(self, known: DiscreteValues, before: DiscreteValues) -> DiscreteValues:
-        """Discrete outputs with those of ``before`` where nobody was asked."""
-        if not self.keys:
+        """Discrete outputs and recorded variables, with those of ``before`` where none was read."""
+        if not known:
             return ()
         return tuple(b if k is None else k for k, b in zip(known, before, strict=True))
 

@@ -1,10 +1,12 @@
-"""Requests of steps for systems in which not everything is continuous."""
+"""Requests of steps for systems in which not everything is continuous, or more is recorded."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isfinite
 from typing import Any
+
+import numpy as np
 
 from master_node.coupling_scheme import CouplingScheme
 from master_node.discrete_coupling import DiscreteValues
@@ -18,11 +20,19 @@ from master_node.step_requests import (
     StepRequests,
 )
 from master_node.system import CoupledSystem
-from protocol.calls import Call, DoStep, GetDiscreteOutputs, GetOutputs, SetDiscreteInputs
+from protocol.calls import (
+    Call,
+    DoStep,
+    GetDiscreteOutputs,
+    GetOutputs,
+    GetRecordedVariables,
+    SetDiscreteInputs,
+)
 from protocol.signals import FloatArray
 from protocol.slave import StartValue
 
 _GET_DISCRETE_OUTPUTS = GetDiscreteOutputs()
+_GET_RECORDED_VARIABLES = GetRecordedVariables()
 
 
 def step_requests(
@@ -35,12 +45,14 @@ def step_requests(
         coupled: their connections.
         scheme: how they are coupled within a step.
     """
-    kind = StepRequests if coupled.discrete.is_empty else DiscreteStepRequests
+    is_plain = coupled.discrete.is_empty and coupled.recorded.is_empty
+    kind = StepRequests if is_plain else DiscreteStepRequests
     return kind(group, coupled, scheme)
 
 
 class DiscreteStepRequests(StepRequests):
-    """Sets discrete inputs before each step and reads discrete outputs after it.
+    """Sets discrete inputs before each step, and reads discrete outputs and recorded variables
+    after it.
 
     Args:
         group: the slaves, at their first communication point.
@@ -53,42 +65,64 @@ class DiscreteStepRequests(StepRequests):
         self._discrete = coupled.discrete
         self._reads = [bool(part.discrete_outputs) for part in coupled.parts]
         self._sets = [bool(part.discrete_inputs) for part in coupled.parts]
+        self._records = list(map(bool, coupled.recorded.names))
 
     def _program(
         self, slave: int, form: RequestForm, pieces: Sequence[Piece], inputs: Sequence[FloatArray]
     ) -> Program:
         calls: list[Call] = []
-        steps = iter(pieces)
+        steps, records = iter(pieces), iter(step.records for step in form.steps)
         for call in super()._program(slave, form, pieces, inputs):
             if type(call) is DoStep and self._sets[slave]:
                 calls.append(SetDiscreteInputs(next(steps).held[slave]))
             calls.append(call)
-            if type(call) is GetOutputs and self._reads[slave]:
-                calls.append(_GET_DISCRETE_OUTPUTS)
+            if type(call) is GetOutputs:
+                if self._reads[slave]:
+                    calls.append(_GET_DISCRETE_OUTPUTS)
+                if next(records) and self._records[slave]:
+                    calls.append(_GET_RECORDED_VARIABLES)
         return tuple(calls)
 
     def _places(self, steps: Sequence[StepForm]) -> Sequence[Sequence[int]]:
         (common, *_) = super()._places(steps)
+        recorded = np.cumsum([0, *(step.records for step in steps)])[:-1].tolist()
         return [
-            [place + sets * (number + 1) + reads * number for number, place in enumerate(common)]
-            for sets, reads in zip(self._sets, self._reads, strict=True)
+            [
+                place + sets * (number + 1) + reads * number + records * recorded[number]
+                for number, place in enumerate(common)
+            ]
+            for sets, reads, records in zip(self._sets, self._reads, self._records, strict=True)
         ]
 
     def _discrete_outputs(
-        self, answers: Sequence[list[Any] | None], places: Sequence[Sequence[int]]
+        self, answers: Sequence[list[Any] | None], form: RequestForm
     ) -> list[DiscreteValues]:
-        found = []
-        for number in range(len(places[0])):
-            d: list[Any] = []
-            for slave, columns in enumerate(self._discrete.output_slices):
-                results = answers[slave]
-                if results is not None and self._reads[slave]:
-                    d += results[places[slave][number] + 1]
-                else:
-                    d += [None] * (columns.stop - columns.start)
-            self._check_finite(d)
-            found.append(tuple(d))
-        return found
+        return [
+            self._values(answers, [places[number] for places in form.places], step.records)
+            for number, step in enumerate(form.steps)
+        ]
+
+    def _values(
+        self, answers: Sequence[list[Any] | None], places: Sequence[int], records: bool
+    ) -> DiscreteValues:
+        """Those of one piece, whose continuous outputs are at these places of the answers."""
+        d: list[Any] = []
+        recorded: list[Any] = []
+        for slave, (columns, names) in enumerate(
+            zip(self._discrete.output_slices, self._recorded.names, strict=True)
+        ):
+            results, place = answers[slave], places[slave] + 1
+            if results is not None and self._reads[slave]:
+                d += results[place]
+                place += 1
+            else:
+                d += [None] * (columns.stop - columns.start)
+            if results is not None and records and names:
+                recorded += self._recorded.values(results[place])
+            else:
+                recorded += [None] * len(names)
+        self._check_finite(d)
+        return (*d, *recorded)
 
     def _check_finite(self, d: Sequence[StartValue | None]) -> None:
         for name, value in zip(self._discrete.names, d, strict=True):

@@ -136,10 +136,10 @@ class DoubleStepper:
         if scheme.known_ahead:
             comparison = solution
         if self._is_long_step:
-            first = StepForm(None, comparison), StepForm((RESTORE_POINT,), solution)
+            first = StepForm(None, comparison, records=False), StepForm((RESTORE_POINT,), solution)
             second = careful = StepForm((), solution)
         else:
-            first = StepForm(None, solution), StepForm((SAVE_HALFWAY,), comparison)
+            first = StepForm(None, solution), StepForm((SAVE_HALFWAY,), comparison, records=False)
             second = StepForm((RESTORE_HALFWAY,), solution)
             careful = StepForm((RESTORE_HALFWAY_AND_KEEP,), solution)
         self._first_request, self._second_request = forms(*first), forms(second)

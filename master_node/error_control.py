@@ -120,7 +120,7 @@ class ErrorControl:
             norm /= abs(1.0 - ratio)
         else:
             norm, index = self._norm(ErrorEstimator.estimate(difference, ratio), scale)
-        limiting = self._names[index]
+        limiting = self._names[index] if self._names else ""
         if not norm < _INF:
             bad = first_not_finite(y)
             if bad is not None:

@@ -14,14 +14,13 @@ from master_node.configuration import System
 from master_node.discrete_coupling import DiscreteValues, Held, HeldInput
 from master_node.numerics.fixed_point import NoFixedPointError, fixed_point
 from master_node.numerics.norms import first_not_finite
-from master_node.outputs import Outputs, gather
+from master_node.outputs import Outputs, gather, reading_calls
 from master_node.slave_group import Program, SlaveGroup
 from master_node.start_values import start_values
 from master_node.step_size_rules import step_size_limits
 from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import (
     ExitInitializationMode,
-    GetDiscreteOutputs,
     GetOutputs,
     Initialize,
     SetDiscreteInputs,
@@ -62,13 +61,17 @@ def initialize(
     start = float(simulation.start_time)
     may_return_early = simulation.estimator != "none" and step_size_limits(system).quantum is None
     group.execute_all(
-        [(_initialize(part, system, may_return_early),) for part in coupled.parts], start
+        [
+            (_initialize(part, names, system, may_return_early),)
+            for part, names in zip(coupled.parts, coupled.recorded.names, strict=True)
+        ],
+        start,
     )
     _InitializationMode(group, coupled, start).propagate()
     get_outputs = get_outputs or [GetOutputs()] * len(coupled.parts)
     programs = [
-        (ExitInitializationMode(), *_read(part, get))
-        for part, get in zip(coupled.parts, get_outputs, strict=True)
+        (ExitInitializationMode(), *calls)
+        for calls in reading_calls(coupled, get_outputs, records=True)
     ]
     replies = group.execute_all(programs, start)
     outputs = gather(coupled, replies, 1 + max(get.order for get in get_outputs))
@@ -79,7 +82,9 @@ def initialize(
     return outputs
 
 
-def _initialize(part: SlavePart, system: System, may_return_early: bool) -> Initialize:
+def _initialize(
+    part: SlavePart, recorded: tuple[str, ...], system: System, may_return_early: bool
+) -> Initialize:
     """What a slave is told; it returns early at an event only if it can go back before it."""
     simulation = system.simulation
     return Initialize(
@@ -93,11 +98,8 @@ def _initialize(part: SlavePart, system: System, may_return_early: bool) -> Init
         discrete_inputs=part.discrete_inputs,
         discrete_outputs=part.discrete_outputs,
         early_return=may_return_early and part.description.state_kind is not StateKind.NONE,
+        recorded=recorded,
     )
-
-
-def _read(part: SlavePart, get: GetOutputs) -> Program:
-    return (get, GetDiscreteOutputs()) if part.discrete_outputs else (get,)
 
 
 class _InitializationMode:
@@ -186,12 +188,9 @@ class _InitializationMode:
 
     def _round(self, programs: Sequence[Program]) -> Outputs:
         """Execute these calls and read all outputs."""
-        get = GetOutputs()
+        reading = reading_calls(self._coupled, [GetOutputs()] * len(self._coupled.parts))
         replies = self._group.execute_all(
-            [
-                (*p, *_read(part, get))
-                for p, part in zip(programs, self._coupled.parts, strict=True)
-            ],
+            [(*program, *calls) for program, calls in zip(programs, reading, strict=True)],
             self._start,
         )
         return gather(self._coupled, replies)

@@ -55,6 +55,9 @@ class RunStart:
         discrete_types: what they hold, d of them.
         discrete_units: their units, "" where none; empty when none has one.
         discrete: their values at T_0, d of them.
+        recorded: names of the variables that were chosen beside the outputs; the continuous ones
+            stand behind the outputs, all others behind the discrete ones.
+        items: of enumerations: the number of each item by its name, by ``slave.variable``.
         statistics: of each slave, by its name; they go on counting while the run goes on.
     """
 
@@ -67,6 +70,8 @@ class RunStart:
     discrete_types: tuple[DiscreteType, ...] = ()
     discrete_units: tuple[str, ...] = ()
     discrete: tuple[DiscreteValue, ...] = ()
+    recorded: frozenset[str] = frozenset()
+    items: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     control: OutputControl = NOT_CONTROLLED
     state_kinds: Mapping[str, str] = field(default_factory=dict)
     statistics: Mapping[str, SlaveStatistics] = field(default_factory=dict)

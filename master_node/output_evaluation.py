@@ -16,11 +16,12 @@ from master_node.coupling_scheme import CouplingScheme
 from master_node.numerics.fixed_point import NoFixedPointError, fixed_point
 from master_node.slave_group import Program, SlaveGroup
 from master_node.system import CoupledSystem
-from protocol.calls import GetOutputs, SetInputs
+from protocol.calls import GetOutputs, GetRecordedVariables, RecordedValues, SetInputs
 from protocol.errors import StepRejectedError
 from protocol.signals import FloatArray
 
-_GET_OUTPUTS = GetOutputs()
+_READ = (GetOutputs(),)
+_READ_ALL = (GetOutputs(), GetRecordedVariables())
 
 
 class OutputEvaluation:
@@ -37,8 +38,9 @@ class OutputEvaluation:
         self._coupled = coupled
         self._slaves = scheme.evaluated
         self._parts = [coupled.parts[slave] for slave in self._slaves]
+        self._recorded_names = [coupled.recorded.names[slave] for slave in self._slaves]
         order = coupled.at_point
-        self._levels = 0 if order.loop else max(1, int(order.levels.max()))
+        self._levels = 0 if order.loop else max(1, int(order.levels.max(initial=0)))
         self._loop = order.loop
         self._tolerance = 1e-3 * np.minimum(
             coupled.absolute_tolerance, np.maximum(coupled.relative_tolerance, 1e-12)
@@ -49,7 +51,15 @@ class OutputEvaluation:
         """Whether there is any output to evaluate again."""
         return bool(self._slaves)
 
-    def evaluate(self, y: FloatArray, external: FloatArray, time: float, step_size: float) -> None:
+    def evaluate(
+        self,
+        y: FloatArray,
+        external: FloatArray,
+        time: float,
+        step_size: float,
+        *,
+        records: bool = False,
+    ) -> dict[int, RecordedValues]:
         """Make the values of ``y`` consistent with each other, in place.
 
         Args:
@@ -58,19 +68,26 @@ class OutputEvaluation:
             external: values of the external inputs there, shape (n_e,).
             time: where that step began [s], for messages.
             step_size: its size [s], for messages.
+            records: read recorded variables, too.
+
+        Returns:
+            What the slaves gave for recorded variables, by their indices.
 
         Raises:
             StepRejectedError: an algebraic loop has no solution that was found.
             DoublestepError: a slave failed.
         """
+        recorded: dict[int, RecordedValues] = {}
 
         def again(values: FloatArray) -> FloatArray:
-            return self._round(values, external, time, step_size)
+            following, found = self._round(values, external, time, step_size, records)
+            recorded.update(found)
+            return following
 
         if not self._loop:
             for _ in range(self._levels):
                 y[0] = again(y[0])
-            return
+            return recorded
         try:
             y[0] = fixed_point(again, y[0], tolerance=self._tolerance)
         except NoFixedPointError as error:
@@ -82,18 +99,23 @@ class OutputEvaluation:
                 time=time,
                 step_size=step_size,
             ) from None
+        return recorded
 
     def _round(
-        self, y: FloatArray, external: FloatArray, time: float, step_size: float
-    ) -> FloatArray:
+        self, y: FloatArray, external: FloatArray, time: float, step_size: float, records: bool
+    ) -> tuple[FloatArray, dict[int, RecordedValues]]:
         u, outside = self._coupled.inputs_of(y)[np.newaxis], external[np.newaxis]
         programs: list[Program] = [
-            (SetInputs(part.columns(u, outside)), _GET_OUTPUTS) for part in self._parts
+            (SetInputs(part.columns(u, outside)), *(_READ_ALL if records and names else _READ))
+            for part, names in zip(self._parts, self._recorded_names, strict=True)
         ]
         replies = self._group.execute(programs, time, step_size, self._slaves)
         following = y.copy()
-        for part, reply in zip(self._parts, replies, strict=True):
+        recorded = {}
+        for slave, part, reply in zip(self._slaves, self._parts, replies, strict=True):
             if reply.error is not None:
                 raise reply.error
             following[part.output_slice] = reply.results[1][0]  # type: ignore[index]
-        return following
+            if isinstance(reply.results[-1], RecordedValues):
+                recorded[slave] = reply.results[-1]
+        return following, recorded

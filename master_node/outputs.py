@@ -9,7 +9,14 @@ import numpy as np
 
 from master_node.discrete_coupling import DiscreteValues
 from master_node.system import CoupledSystem
-from protocol.calls import Reply
+from protocol.calls import (
+    Call,
+    GetDiscreteOutputs,
+    GetOutputs,
+    GetRecordedVariables,
+    RecordedValues,
+    Reply,
+)
 from protocol.signals import FloatArray
 from protocol.slave import StartValue
 
@@ -19,7 +26,7 @@ class Outputs(NamedTuple):
 
     Attributes:
         y: continuous outputs, shape (m,) or (rows, m), with derivatives in further rows.
-        d: discrete outputs.
+        d: discrete outputs, then recorded variables; None stands for one that was not read.
     """
 
     y: FloatArray
@@ -31,19 +38,38 @@ NO_OUTPUTS = Outputs(np.zeros((1, 0)))
 
 
 def gather(coupled: CoupledSystem, replies: Sequence[Reply], rows: int = 1) -> Outputs:
-    """The outputs at the end of each reply: of `GetOutputs`, then of `GetDiscreteOutputs`.
+    """The outputs at the end of each reply.
 
     Args:
         coupled: the system.
-        replies: of all slaves; only those that have discrete outputs were asked for them.
+        replies: of all slaves, to `reading_calls`.
         rows: of the array; rows that were not read are 0.
     """
     y = np.zeros((rows, len(coupled.output_names)))
     d: list[StartValue] = []
-    for part, reply in zip(coupled.parts, replies, strict=True):
-        results: list[Any] = reply.results
+    recorded: list[StartValue | None] = []
+    for part, names, reply in zip(coupled.parts, coupled.recorded.names, replies, strict=True):
+        results: list[Any] = list(reply.results)
+        if isinstance(results[-1], RecordedValues):
+            recorded += coupled.recorded.values(results.pop())
+        else:
+            recorded += [None] * len(names)
         if part.discrete_outputs:
-            d += results[-1]
-        values = results[-2 if part.discrete_outputs else -1]
+            d += results.pop()
+        values = results.pop()
         y[: len(values), part.output_slice] = values
-    return Outputs(y, tuple(d))
+    return Outputs(y, (*d, *recorded))  # type: ignore[arg-type]
+
+
+def reading_calls(
+    coupled: CoupledSystem, get_outputs: Sequence[GetOutputs], *, records: bool = False
+) -> list[tuple[Call, ...]]:
+    """The calls that read all outputs of each slave, and the recorded variables if ``records``."""
+    return [
+        (
+            get,
+            *((GetDiscreteOutputs(),) if part.discrete_outputs else ()),
+            *((GetRecordedVariables(),) if names and records else ()),
+        )
+        for part, names, get in zip(coupled.parts, coupled.recorded.names, get_outputs, strict=True)
+    ]

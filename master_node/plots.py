@@ -135,13 +135,17 @@ def _drawable(result: Result) -> list[str]:
 
 
 def _panels(result: Result, names: Sequence[str]) -> list[list[str]]:
-    """Names by unit, by slave where no unit is known; as many to a panel as colours."""
+    """Names by unit, by slave where no unit is known; as many to a panel as colours.
+
+    An enumeration has a panel of its own, for the names of its items.
+    """
     groups: dict[tuple[str, str], list[str]] = {}
     for name in names:
         if result[name].dtype.kind == "O":  # an unknown name is an error here, too
             raise KeyError(f"{name} holds no numbers")
         unit = result.units.get(name, "")
         key = (unit, "") if unit else ("", name.split(".", 1)[0])
+        key = ("", name) if name in result.enumerations else key
         groups.setdefault(key, []).append(name)
     size = _LINES_PER_PANEL
     return [group[i : i + size] for group in groups.values() for i in range(0, len(group), size)]
@@ -205,6 +209,9 @@ def _draw_outputs(axes: Axes, result: Result, names: Sequence[str]) -> None:
         )
     unit = result.units.get(names[0], "")
     axes.set_ylabel(f"[{_shortened(unit)}]" if unit else _shortened(names[0].split(".", 1)[0]))
+    items = result.enumerations.get(names[0], {})
+    if items:
+        axes.set_yticks(list(items.values()), [_shortened(item) for item in items])
     _legend(axes, names)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -23,13 +24,18 @@ class ReachedPoint(NamedTuple):
     Attributes:
         time: [s].
         y: outputs there, shape (rows, m).
-        d: discrete outputs there.
+        d: discrete outputs there, then recorded variables.
     """
 
     time: float
     y: FloatArray
     d: DiscreteValues = ()
 
+
+log = logging.getLogger("master_node")
+
+_COARSE = 100.0
+"""Tolerances: two polynomials that differ by more do not tell what lies between their points."""
 
 Reached = tuple[ReachedPoint, ...]
 """In the order of time."""
@@ -54,7 +60,7 @@ class ResultPoints:
 
     Args:
         grid: where results are wanted; None: at the communication points.
-        coupled: the system, with its tolerances.
+        coupled: the system, for names and tolerances, and for what results hold beside outputs.
         has_derivative: which outputs come with their derivatives, shape (m,).
         time: T_0 [s].
         outputs: there.
@@ -69,11 +75,21 @@ class ResultPoints:
         outputs: Outputs,
     ) -> None:
         self._grid = grid
-        self._absolute_tolerance = coupled.absolute_tolerance
-        self._relative_tolerance = coupled.relative_tolerance
-        self._has_derivative = has_derivative
-        self._history = OutputHistory((time,), (outputs.y,))
-        self._d = outputs.d
+        self._recorded = recorded = coupled.recorded
+        self._names = (*coupled.output_names, *(one.name for one in recorded.continuous))
+        self._absolute_tolerance, self._relative_tolerance = (
+            np.concatenate([own, np.array(more)])
+            for own, more in zip(
+                (coupled.absolute_tolerance, coupled.relative_tolerance),
+                recorded.tolerances,
+                strict=True,
+            )
+        )
+        self._has_warned = False
+        more = np.zeros(len(recorded.continuous), np.bool_)
+        self._has_derivative = np.concatenate([has_derivative, more])
+        y, self._d = recorded.split(outputs.y, outputs.d)
+        self._history = OutputHistory((time,), (y,))
         self._number = 1
 
     @property
@@ -92,6 +108,7 @@ class ResultPoints:
             reached: in the order of time.
             order: k of the steps that led there.
         """
+        reached = self._split(reached)
         if self._grid is None:
             return _values(reached)
         for point in reached:
@@ -101,11 +118,16 @@ class ResultPoints:
         if not times:
             return ()
         scale = error_scale(reached[-1].y[0], self._absolute_tolerance, self._relative_tolerance)
-        values = self._history.at(np.array(times), order, self._has_derivative, scale)
+        history, at = self._history, np.array(times)
+        values = history.at(at, order, self._has_derivative, scale)
+        if not self._has_warned and history.can_compare(order):
+            others = history.at(at, order, self._has_derivative, scale, more=1)
+            self._compare(times, values, others)
         return tuple(map(Point, times, values, held))
 
     def jumped(self, reached: Reached) -> Points:
         """The same for points that lead over a discontinuity: nothing smooth lies between them."""
+        reached = self._split(reached)
         time, y, _ = reached[-1]
         self._history = OutputHistory((time,), (y,))
         if self._grid is None:
@@ -116,7 +138,31 @@ class ResultPoints:
 
     def cut(self, point: ReachedPoint) -> None:
         """Forget what was before: nothing smooth leads over ``point``."""
-        self._history = OutputHistory((point.time,), (point.y,))
+        y, _ = self._recorded.split(point.y, point.d)
+        self._history = OutputHistory((point.time,), (y,))
+
+    def _split(self, reached: Reached) -> Reached:
+        """With what is recorded among the outputs and the discrete ones."""
+        if self._recorded.is_empty:
+            return reached
+        return tuple(ReachedPoint(p.time, *self._recorded.split(p.y, p.d)) for p in reached)
+
+    def _compare(self, times: Sequence[float], values: FloatArray, others: FloatArray) -> None:
+        """Warn, once, where communication points lie too far apart to read between them."""
+        scale = self._absolute_tolerance + self._relative_tolerance * np.abs(values)
+        deviation = np.abs(values - others) / scale
+        if not (deviation > _COARSE).any():  # what is not finite is told by itself
+            return
+        row, column = divmod(int(np.nanargmax(deviation)), deviation.shape[1])
+        log.warning(
+            "results between communication points are not as accurate as those at them: two "
+            "polynomials differ at t=%r s by %.2g times the tolerance of %s; give "
+            "[simulation] largest_step_size, or leave out output_interval",
+            times[row],
+            deviation[row, column],
+            self._names[column],
+        )
+        self._has_warned = True
 
     def _held(self, times: Sequence[float], reached: Reached) -> list[DiscreteValues]:
         """Discrete outputs at ``times``: what they were at the communication point before."""

@@ -45,9 +45,8 @@ from master_node.resumption import (
 )
 from master_node.shared_process import Baseline, SharedProcess, shared_process
 from master_node.slave_group import SlaveGroup
-from master_node.slave_link import SlaveLink
 from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
-from master_node.step_size_rules import check_step_sizes, with_fixed_steps
+from master_node.step_size_rules import check_step_sizes, with_bounded_steps, with_fixed_steps
 from master_node.system import resolve
 from master_node.trace import TraceWriter
 from master_node.trust import check_own
@@ -241,13 +240,14 @@ def _co_simulation(  # noqa: PLR0917  what a run is made of
         check_models(resumption.saved, slaves.descriptions)
     check_hashes(system, slaves.descriptions)
     restorable = _restorable(slaves, system, directory)
-    links: dict[str, SlaveLink] = dict(slaves.links)
-    links |= {slave.name: slave for slave in restorable}
+    links = {**slaves.links, **{slave.name: slave for slave in restorable}}
     given = system
     descriptions = configure(links, system, slaves.descriptions)
     system = with_fixed_steps(system, descriptions)
+    coupled = resolve(system, descriptions, signals)
+    system = with_bounded_steps(system, coupled)
     check_step_sizes(system)
-    warnings = check_capabilities(resolve(system, descriptions, signals), system)
+    warnings = check_capabilities(coupled, system)
     for warning in warnings:
         log.warning("%s", warning)
     group = SlaveGroup(links, traces)
@@ -257,8 +257,12 @@ def _co_simulation(  # noqa: PLR0917  what a run is made of
         if warning not in warnings:
             log.warning("%s", warning)
     wanted = system.results
+    recorded = (*coupled.recorded.continuous, *coupled.recorded.discrete)
     check_variables(
-        wanted.variables, (*coupled.output_names, *coupled.discrete.names), system.source
+        wanted.variables,
+        (*coupled.output_names, *coupled.discrete.names),
+        system.source,
+        [one.name for one in recorded],
     )
     resumed = None if resumption is None else resumption.resumed
     store = None

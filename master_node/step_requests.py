@@ -100,10 +100,12 @@ class StepForm(NamedTuple):
     Attributes:
         before: what each slave does first: save or restore; None: what the last attempt calls for.
         get_outputs: what each slave is asked for at the end.
+        records: whether recorded variables are read there, too.
     """
 
     before: tuple[Call, ...] | None
     get_outputs: Sequence[GetOutputs]
+    records: bool = True
 
 
 class RequestForm(NamedTuple):
@@ -165,6 +167,7 @@ class StepRequests:
         ]
         self._output_slices = [part.output_slice for part in coupled.parts]
         self._scheme = scheme
+        self._recorded = coupled.recorded
         self._slaves = range(len(coupled.parts))
         self._unknown = np.zeros((scheme.output_rows, len(self._names)))
         self._evaluation = OutputEvaluation(group, coupled, scheme)
@@ -214,14 +217,18 @@ class StepRequests:
             (outputs,) = self.request(form, [piece])
             step = piece.step
             try:
-                self._evaluation.evaluate(
-                    outputs.y, piece.external.end, step.communication_point, step.step_size
+                recorded = self._evaluation.evaluate(
+                    outputs.y,
+                    piece.external.end,
+                    step.communication_point,
+                    step.step_size,
+                    records=form.steps[0].records,
                 )
             except StepRejectedError as error:
                 failed = FailedStep("", None, _NAN, error.cause, error)
                 raise BrokenOffError(failed) from None
             self._check_values(outputs.y)
-            found.append(outputs)
+            found.append(Outputs(outputs.y, self._recorded.replaced(outputs.d, recorded)))
         return found
 
     def request(self, form: RequestForm, pieces: Sequence[Piece]) -> list[Outputs]:
@@ -243,7 +250,7 @@ class StepRequests:
                 for y, place in zip(values, places[slave], strict=True):
                     y[: len(results[place]), columns] = results[place]
             self._check_values(values)  # before anyone else gets them
-        return list(map(Outputs, values, self._discrete_outputs(answers, places)))
+        return list(map(Outputs, values, self._discrete_outputs(answers, form)))
 
     def _request_at_once(self, form: RequestForm, pieces: Sequence[Piece]) -> list[Outputs]:
         """The same for all slaves at a time, all answers being of one shape."""
@@ -251,7 +258,7 @@ class StepRequests:
         answers = self._results(form, pieces, inputs, self._slaves)
         values = np.concatenate([answers[slave][place] for slave, place in form.outputs], axis=1)
         self._check_values(values)
-        discrete = self._discrete_outputs(answers, form.places)
+        discrete = self._discrete_outputs(answers, form)
         if len(pieces) == 1:
             return [Outputs(values, discrete[0])]
         first, second = discrete
@@ -277,17 +284,17 @@ class StepRequests:
     def _discrete_outputs(
         self,
         answers: Sequence[list[Any] | None],  # noqa: ARG002  all is continuous
-        places: Sequence[Sequence[int]],
+        form: RequestForm,
     ) -> list[DiscreteValues]:
         """Those of each piece, from the results of each slave, None if it was not asked."""
-        return [()] * len(places[0])
+        return [()] * len(form.steps)
 
     def _program(
         self, slave: int, form: RequestForm, pieces: Sequence[Piece], inputs: Sequence[FloatArray]
     ) -> Program:
         columns = self._columns[slave]
         calls: list[Call] = []
-        for (before, get_outputs), piece, derivatives in zip(
+        for (before, get_outputs, _), piece, derivatives in zip(
             form.steps, pieces, inputs, strict=True
         ):
             if before is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from math import ulp
@@ -14,8 +15,11 @@ from master_node.numerics.step_size_limits import (
     StepSizeLimits,
     StepSizeLimitsError,
 )
+from master_node.system import CoupledSystem
 from protocol.errors import ConfigurationError
 from protocol.slave import SlaveDescription
+
+log = logging.getLogger("master_node")
 
 _RESOLUTION = 64.0
 """H is that many times the distance of neighbouring numbers at least: T + H is a later time then,
@@ -62,6 +66,28 @@ def step_size_limits(system: System) -> StepSizeLimits:
             f"{system.source}: no communication step size suits all: {error}"
         ) from None
     return limits
+
+
+def with_bounded_steps(system: System, coupled: CoupledSystem) -> System:
+    """The system with bounded steps, if there is no continuous output to control them by.
+
+    A thousandth of the simulated time, unless the system says more; a warning says so.
+    """
+    settings = system.simulation
+    is_bounded = settings.estimator == "none" or settings.largest_step_size is not None
+    if coupled.output_names or is_bounded:
+        return system
+    largest = max(
+        1e-3 * (settings.end - settings.start_time),
+        settings.initial_step_size or 0.0,
+        settings.smallest,
+    )
+    log.warning(
+        "no slave has a continuous output, so there is no error to control: communication steps "
+        "are of %r s at most; largest_step_size says otherwise",
+        largest,
+    )
+    return system.with_simulation(largest_step_size=largest)
 
 
 def crossings(

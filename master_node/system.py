@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
@@ -26,6 +26,7 @@ from master_node.external_resolution import (
     resolve_external,
 )
 from master_node.input_loading import load_signals
+from master_node.recorded_variables import RecordedVariables, wanted_variables
 from master_node.tolerances import tolerance
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
@@ -142,6 +143,7 @@ class CoupledSystem:
         initialization, at_point: the order in which values propagate through the slaves in
             initialization mode and at a communication point.
         discrete: all connections and outputs that are not continuous.
+        recorded: variables that are read for results only.
         external: the external inputs.
         held_feed_through: whether an output depends directly on an external input that changes
             and is held in each step, shape (m,).
@@ -161,6 +163,7 @@ class CoupledSystem:
     initialization: FeedThroughOrder
     at_point: FeedThroughOrder
     discrete: DiscreteCoupling
+    recorded: RecordedVariables
     external: ExternalInputs
     held_feed_through: NDArray[np.bool_]
 
@@ -230,12 +233,9 @@ def resolve(
     is_controlled = np.array(
         [v.name not in system.slaves[slave].uncontrolled for slave, v in everything], dtype=np.bool_
     )
-    if not is_controlled.any() and system.simulation.estimator != "none":
-        message = "no slave has a continuous real output: there is nothing to control"
-        if output_index:
-            message = "all outputs are uncontrolled: there is nothing to control"
+    if output_index and not is_controlled.any() and system.simulation.estimator != "none":
         raise ConfigurationError(
-            f"{system.source}: {message}",
+            f"{system.source}: all outputs are uncontrolled: there is nothing to control",
             remedy="use --estimator none with a fixed --step-size",
         )
     feeding: dict[str, dict[str, ScalarConnection]] = {name: {} for name in descriptions}
@@ -263,6 +263,18 @@ def resolve(
         output_index,
         [external[part.name].driven for part in parts],
     )
+    wanted = system.results
+    recorded = RecordedVariables(
+        wanted_variables(
+            system.source,
+            descriptions,
+            {*output_index, *discrete.keys},
+            wanted.locals,
+            wanted.variables,
+        ),
+        len(discrete.keys),
+        partial(tolerance, system),
+    )
     return CoupledSystem(
         parts=parts,
         source=np.array([output_index[feed.source.key] for feed in feeds], dtype=np.intp),
@@ -278,6 +290,7 @@ def resolve(
         initialization=_feed_through_order(output_index, discrete, initial, feeding),
         at_point=_feed_through_order(output_index, discrete, direct, feeding),
         discrete=discrete,
+        recorded=recorded,
         external=ExternalInputs([one for each in external.values() for one in each.continuous]),
         held_feed_through=_depends(
             parts,

@@ -65,6 +65,8 @@ class Initialize:
         discrete_inputs: the same for `SetDiscreteInputs`.
         discrete_outputs: the same for `GetDiscreteOutputs`.
         early_return: whether a step may end at an event within it.
+        recorded: names of the variables that are read for results only, see
+            `GetRecordedVariables`.
     """
 
     verb: ClassVar[str] = "initialize"
@@ -77,6 +79,7 @@ class Initialize:
     discrete_inputs: tuple[str, ...] = ()
     discrete_outputs: tuple[str, ...] = ()
     early_return: bool = False
+    recorded: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +175,13 @@ class GetDiscreteOutputs:
 
 
 @dataclass(frozen=True, slots=True)
+class GetRecordedVariables:
+    """Values of the variables that are read for results only. Result: `RecordedValues`."""
+
+    verb: ClassVar[str] = "get_recorded_variables"
+
+
+@dataclass(frozen=True, slots=True)
 class GetState:
     """fmi2GetFMUstate: save the state under the number ``state``. Result: None.
 
@@ -252,6 +262,7 @@ Call = (
     | DoStep
     | GetOutputs
     | GetDiscreteOutputs
+    | GetRecordedVariables
     | GetState
     | SetState
     | FreeState
@@ -272,6 +283,7 @@ CALLS: tuple[type[Call], ...] = (
     DoStep,
     GetOutputs,
     GetDiscreteOutputs,
+    GetRecordedVariables,
     GetState,
     SetState,
     FreeState,
@@ -292,6 +304,18 @@ class StepResult(NamedTuple):
 
     status: StepStatus
     time: float
+
+
+class RecordedValues(NamedTuple):
+    """What variables have that are read for results only.
+
+    Attributes:
+        numbers: of those with a floating-point type, in order, shape (1, n).
+        others: of all others, in order.
+    """
+
+    numbers: FloatArray
+    others: tuple[StartValue, ...]
 
 
 class Reply(NamedTuple):

@@ -12,6 +12,7 @@
              [verb, field, field, ...]                all others, no numbers left out
     result   [rows, columns] for outputs              numbers: rows x columns
              status for a step                        numbers: time
+             [n, other, other, ...] for recorded      numbers: n of floating-point types
              what it is, for all others               a description is a map by field name
 
 From one double step to the next only the numbers change, so a shape is parsed and checked once and
@@ -63,8 +64,10 @@ from protocol.calls import (
     FreeState,
     GetDiscreteOutputs,
     GetOutputs,
+    GetRecordedVariables,
     GetState,
     Initialize,
+    RecordedValues,
     Reply,
     Reset,
     SerializeState,
@@ -342,6 +345,7 @@ _FIELDS: Mapping[type[Call], Mapping[str, _Check]] = {
         "discrete_inputs": _names,
         "discrete_outputs": _names,
         "early_return": _boolean,
+        "recorded": _names,
     },
     Examine: {
         "communication_point": _number,
@@ -517,7 +521,9 @@ def encode_program(calls: Sequence[Call]) -> bytes:
 _Shape = Call | tuple[int, ...] | bool
 """A call without its numbers: those of inputs and steps are left out."""
 
-_REPEATED: Final = frozenset({GetOutputs, GetDiscreteOutputs, GetState, SetState, FreeState})
+_REPEATED: Final = frozenset(
+    {GetOutputs, GetDiscreteOutputs, GetRecordedVariables, GetState, SetState, FreeState}
+)
 """Calls that come again in every step, apart from inputs and steps."""
 
 
@@ -649,6 +655,9 @@ def _encoded(reply: Reply) -> bytes:
         elif type(result) is StepResult:
             shape.append(result.status.value)
             numbers.append(_ONE.pack(result.time))
+        elif type(result) is RecordedValues:
+            shape.append((result.numbers.size, *result.others))
+            numbers.append(_float_buffer(result.numbers))
         else:
             shape.append(_plain(result))
     return _packed_with_block(
@@ -662,6 +671,8 @@ def _plain(result: object) -> Any:
         return [len(result), result.astype(_LITTLE_ENDIAN, copy=False).tobytes()]
     if isinstance(result, StepResult):
         return [result.status.value, result.time]
+    if isinstance(result, RecordedValues):
+        return [*result.numbers.ravel().tolist(), *result.others]
     if isinstance(result, SlaveDescription):
         return asdict(_within_limits(result))
     if isinstance(result, Examination):
@@ -769,6 +780,10 @@ def _reply_plan(shape: bytes, kinds: tuple[type[Call], ...]) -> _Plan:
             builder.add(_record(Examination, item, _EXAMINATION_FIELDS))
         elif kind is GetDiscreteOutputs:
             builder.add(_values(item, "discrete outputs"))
+        elif kind is GetRecordedVariables:
+            number, *others = _values(item, "recorded variables") or (None,)
+            _, columns = _matrix(1, number, "recorded variables")
+            builder.add_made(_recorded_maker(tuple(others)), columns)
         elif kind is SerializeState:
             builder.add(_binary(item, "a serialized state"))
         elif item is None:
@@ -783,6 +798,10 @@ _cached_reply_plan = lru_cache(_CACHED_SHAPES)(_reply_plan)
 
 def _array_maker(size: tuple[int, int]) -> _Maker:
     return lambda numbers: numbers.reshape(size)
+
+
+def _recorded_maker(others: tuple[StartValue, ...]) -> _Maker:
+    return lambda numbers: RecordedValues(numbers.reshape(1, -1), others)
 
 
 def _step_result_maker(status: StepStatus) -> _Maker:

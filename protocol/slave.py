@@ -13,7 +13,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
-from protocol.calls import Call, Reply, StepResult
+import numpy as np
+
+from protocol.calls import Call, RecordedValues, Reply, StepResult
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
 
@@ -369,6 +371,18 @@ class Slave(ABC):
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """The discrete outputs, one value for each."""
         return ()
+
+    def record(self, names: Sequence[str]) -> None:
+        """Fix the variables of `get_recorded_variables`, right before ``initialize``.
+
+        They may have any causality; to read them changes nothing of what the slave does.
+        """
+        if names:
+            raise SlaveError(f"{self.description.model} has no variables to record: {[*names]}")
+
+    def get_recorded_variables(self) -> RecordedValues:
+        """Their values as they are, finite or not."""
+        return RecordedValues(np.zeros((1, 0)), ())
 
     @abstractmethod
     def get_state(self) -> object:

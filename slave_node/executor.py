@@ -18,6 +18,7 @@ from protocol.calls import (
     FreeState,
     GetDiscreteOutputs,
     GetOutputs,
+    GetRecordedVariables,
     GetState,
     Initialize,
     Reply,
@@ -97,6 +98,7 @@ class Executor:
             ),
             GetOutputs: lambda call: get_outputs(call.order),
             GetDiscreteOutputs: lambda _: slave.get_discrete_outputs(),
+            GetRecordedVariables: lambda _: slave.get_recorded_variables(),
             GetState: lambda call: save(call.state),
             SetState: lambda call: restore(call.state, free=call.free),
             FreeState: lambda call: self._snapshots.free(call.state),
@@ -197,6 +199,7 @@ class Executor:
         self._configuration = configuration
 
     def _initialize(self, call: Initialize) -> None:
+        self._slave.record(call.recorded)
         self._slave.initialize(
             start_time=call.start_time,
             stop_time=call.stop_time,

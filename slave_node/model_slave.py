@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import BDF, DOP853, RK23, RK45, Radau
 
-from protocol.calls import StepResult
+from protocol.calls import RecordedValues, StepResult
 from protocol.errors import (
     ConfigurationError,
     DoublestepError,
@@ -101,7 +101,9 @@ class ModelSlave(Slave):
         self._model_class = model
         self._input_names = [v.name for v in model.inputs]
         self._output_names = [v.name for v in model.outputs]
+        self._state_names = [v.name for v in model.states]
         self._nominal = np.array([v.nominal for v in model.states])
+        self._recorded: tuple[str, ...] = ()
         self.reset()
 
     # ---- Set up and tear down -----------------------------------------------------------------
@@ -391,6 +393,43 @@ class ModelSlave(Slave):
 
     def _at(self, method: str, t: float | None = None) -> str:
         return f"{self.description.model}.{method}()" + (f" at t={t!r} s" if t is not None else "")
+
+    # ---- Variables that are recorded ----------------------------------------------------------
+
+    def record(self, names: Sequence[str]) -> None:
+        """See `Slave`: inputs, outputs, states and parameters.
+
+        Raises:
+            ConfigurationError: the model has no variable of a name.
+        """
+        known = [v.name for v in self.description.variables]
+        self._columns("variable", names, known)
+        self._recorded = tuple(names)
+
+    def get_recorded_variables(self) -> RecordedValues:
+        """See `Slave`.
+
+        Raises:
+            StepRejectedError, SlaveError: an output has no value.
+        """
+        state = self._state
+        u = state.inputs.derivatives[0]
+        numbers = dict(zip(self._state_names, state.x.tolist(), strict=True))
+        numbers |= zip(self._input_names, u.tolist(), strict=True)
+        if not set(self._recorded).isdisjoint(self._output_names):
+            y = self._evaluate("output_values", len(self._output_names), state.time, state.x, u)
+            numbers |= zip(self._output_names, y.tolist(), strict=True)
+        others: dict[str, StartValue] = {}
+        for parameter in self._model.parameters:
+            value = getattr(self._model, parameter.name)
+            if parameter.type.is_real:
+                numbers[parameter.name] = float(value)
+            else:
+                others[parameter.name] = value
+        return RecordedValues(
+            np.array([[numbers[name] for name in self._recorded if name in numbers]]),
+            tuple(others[name] for name in self._recorded if name in others),
+        )
 
     # ---- Saved states -------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from protocol.calls import Configure, StepResult
+from protocol.calls import Configure, RecordedValues, StepResult
 from protocol.errors import SlaveError
 from protocol.signals import MAX_ORDER, FloatArray, InputSignal
 from protocol.slave import (
@@ -233,6 +233,14 @@ class SubstepSlave(Slave):
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """See `Slave`."""
         return self._slave.get_discrete_outputs()
+
+    def record(self, names: Sequence[str]) -> None:
+        """See `Slave`."""
+        self._slave.record(names)
+
+    def get_recorded_variables(self) -> RecordedValues:
+        """See `Slave`."""
+        return self._slave.get_recorded_variables()
 
     # ---- Step ---------------------------------------------------------------------------------
 

@@ -85,8 +85,12 @@ class Slave1:
     def set(self, **values: float) -> None:
         self.fmu.setReal(self.content.references(list(values)), list(values.values()))
 
-    def get(self, *names: str) -> list[float]:
-        return list(self.fmu.getReal(self.content.references(names)))
+    def get(self, *names: str) -> list[Any]:
+        values = []
+        for name in names:
+            kind = _FMI2_KINDS[self.content.variables[name].type]
+            values += list(getattr(self.fmu, f"get{kind}")(self.content.references([name])))
+        return values
 
     def set_derivatives(self, order: int, **values: float) -> None:
         n = len(values)

@@ -44,3 +44,14 @@ class Room(Model):
     def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
         """The temperature."""
         return [(30.0 * u[0] - (x[0] - 283.15)) / 2.0]
+
+
+class Wave(Model):
+    """x = sin(t), which depends on no input."""
+
+    states = (real("x", start=0.0), real("v", start=1.0))
+    outputs = (real("x"),)
+
+    def derivatives(self, t: float, x: Any, u: Any) -> list[float]:
+        """The states."""
+        return [x[1], -x[0]]

@@ -29,8 +29,10 @@ from protocol.calls import (
     FreeState,
     GetDiscreteOutputs,
     GetOutputs,
+    GetRecordedVariables,
     GetState,
     Initialize,
+    RecordedValues,
     Reply,
     Reset,
     SerializeState,
@@ -91,7 +93,7 @@ any_float = st.one_of(
 )
 texts = st.text(st.characters(codec="utf-8"), max_size=20)
 numbers = st.integers(0, 2**63 - 1)
-NAMES: list[Any] = [[], [], [], [], False]
+NAMES: list[Any] = [[], [], [], [], False, []]
 """The fields of `Initialize` from ``inputs`` on."""
 
 start_values = st.one_of(
@@ -109,7 +111,15 @@ def arrays() -> st.SearchStrategy[np.ndarray]:
 
 
 calls = st.one_of(
-    st.sampled_from([Describe(), ExitInitializationMode(), GetDiscreteOutputs(), Terminate()]),
+    st.sampled_from(
+        [
+            Describe(),
+            ExitInitializationMode(),
+            GetDiscreteOutputs(),
+            GetRecordedVariables(),
+            Terminate(),
+        ]
+    ),
     st.builds(
         Initialize,
         any_float,
@@ -118,6 +128,7 @@ calls = st.one_of(
         st.dictionaries(texts, start_values, max_size=3),
         *[st.lists(texts, max_size=3).map(tuple)] * 4,
         st.booleans(),
+        st.lists(texts, max_size=3).map(tuple),
     ),
     st.builds(
         Configure,
@@ -168,6 +179,8 @@ descriptions = st.builds(
             st.none() | start_values,
             any_float,
             texts,
+            *[st.none() | any_float | st.integers(-(2**63), 2**64 - 1)] * 2,
+            st.dictionaries(texts, st.integers(-(2**63), 2**63 - 1), max_size=3),
         ),
         max_size=3,
     ).map(tuple),
@@ -237,6 +250,9 @@ def results_of(call: Call) -> st.SearchStrategy[object]:  # noqa: PLR0911
             return st.binary(max_size=50)
         case GetDiscreteOutputs():
             return st.lists(start_values, max_size=5).map(tuple)
+        case GetRecordedVariables():
+            others = st.lists(start_values, max_size=5).map(tuple)
+            return st.builds(RecordedValues, arrays().map(lambda array: array[:1]), others)
         case Describe() | Configure():
             return descriptions
         case Examine():
@@ -297,6 +313,7 @@ def test_the_examples_cover_every_call() -> None:
         Examine,
         SetDiscreteInputs,
         GetDiscreteOutputs,
+        GetRecordedVariables,
         Initialize,
         ExitInitializationMode,
         SetInputs,

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from master_node import load_system, simulate
+from master_node import System, load_system, simulate
 from master_node.numerics.dense_output import OutputGrid, OutputHistory
 from tests.quarter_car_case import EXAMPLES, STATES, exact_solution
 
@@ -175,3 +175,25 @@ def test_dense_output_does_not_depend_on_the_grid(fmu_dir: Path) -> None:
     coarse = simulate(system, in_process=True, stop_time=1.0, output_interval=0.125)
     assert fine.outputs[::2].tobytes() == coarse.outputs.tobytes()
     assert fine.steps["time"].tolist() == coarse.steps["time"].tolist()
+
+
+def test_points_too_far_apart_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    """A slave that depends on nothing moves between steps as long as the system likes them.
+
+    Results at the points are right; those between them are not, and a warning says so. Steps as
+    short as it says mend that.
+    """
+    system = System(
+        simulation={"stop_time": 20.0, "output_interval": 0.05},
+        slaves={"wave": {"model": "driven_models.py:Wave"}},
+        base=Path(__file__).parent,
+    )
+    coarse = simulate(system, in_process=True)
+    error = np.abs(coarse["wave.x"] - np.sin(coarse.time))
+    told = "results between communication points are not as accurate as those at them"
+    assert error.max() > 0.01
+    assert caplog.text.count(told) == 1
+    caplog.clear()
+    fine = simulate(system.with_simulation(largest_step_size=0.1), in_process=True)
+    assert np.abs(fine["wave.x"] - np.sin(fine.time)).max() < 1e-3
+    assert told not in caplog.text

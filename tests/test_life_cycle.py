@@ -24,8 +24,10 @@ from protocol.calls import (
     FreeState,
     GetDiscreteOutputs,
     GetOutputs,
+    GetRecordedVariables,
     GetState,
     Initialize,
+    RecordedValues,
     Reset,
     SerializeState,
     SetDiscreteInputs,
@@ -116,6 +118,14 @@ class Recorder(Slave):
         self._hear("get_discrete_outputs")
         return ()
 
+    def record(self, names: Sequence[str]) -> None:
+        if names:
+            self._hear("record")
+
+    def get_recorded_variables(self) -> RecordedValues:
+        self._hear("get_recorded_variables")
+        return RecordedValues(np.zeros((1, 0)), ())
+
     def get_state(self) -> object:
         return self._make("get_state")
 
@@ -155,6 +165,7 @@ EXAMPLES: dict[type[Call], Call] = {
         Examine(0.5, 0.25),
         SetDiscreteInputs((1,)),
         GetDiscreteOutputs(),
+        GetRecordedVariables(),
         SetInputs(np.zeros((1, 0))),
         STEP,
         GetOutputs(),

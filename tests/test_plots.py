@@ -131,6 +131,21 @@ def test_discrete_variables_are_drawn_as_steps() -> None:
         result.plot(variables=["box.label"])
 
 
+def test_an_enumeration_has_a_panel_with_the_names_of_its_items() -> None:
+    """Numbers of other variables do not share it."""
+    bare = make_result()
+    n = len(bare.time)
+    result = replace(
+        bare,
+        units={**bare.units, "box.gear": "", "box.count": ""},
+        discrete={"box.gear": np.arange(n) % 2, "box.count": np.arange(n)},
+        enumerations={"box.gear": {"neutral": 0, "first": 1}},
+    )
+    figure = result.plot(variables=["box.gear", "box.count"])
+    assert [legend(figure, panel) for panel in (0, 1)] == [["box.gear"], ["box.count"]]
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["neutral", "first"]
+
+
 def test_many_variables_are_cut_and_it_is_said() -> None:
     """A picture has an end; what is missing in it is in its title, and can be asked for."""
     names = tuple(f"plant.x[{i}]" for i in range(200))

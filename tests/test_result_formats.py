@@ -36,12 +36,12 @@ from master_node.observers import (
     RunStart,
     Statistics,
 )
+from master_node.patterns import chosen
 from master_node.results import (
     Recording,
     ResultsWriter,
     SelectedResults,
     check_variables,
-    chosen,
     parquet_file,
 )
 from master_node.results import writer as writer_module

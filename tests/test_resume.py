@@ -23,12 +23,12 @@ from master_node.controlled_run import Position
 from master_node.numerics.discontinuities import Search, SmoothStep
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
 from master_node.numerics.order_control import OrderMemory
-from master_node.observers import Attempt
 from master_node.outputs import Outputs
 from master_node.plain_values import from_plain, to_plain
 from master_node.results import completion
 from master_node.results.files import cannot_write
 from protocol.errors import ConfigurationError, InterruptedRunError, ResultsError
+from tests.interrupting import Interrupt
 from tests.quarter_car_case import EXAMPLES
 from tests.test_processes import (
     MainCommand,
@@ -47,25 +47,6 @@ __all__ = ["command", "start"]
 pytestmark = pytest.mark.usefixtures("no_process_left")
 
 TRAPPED = f"{Path(__file__).parent / 'trap_models.py'}:Trapped"
-
-
-class Interrupt:
-    """An observer that is Ctrl-C after some attempts: at any moment between two requests."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-    def started(self, _: object) -> None:
-        """Nothing."""
-
-    def attempted(self, _: Attempt) -> None:
-        """Count down."""
-        self.number -= 1
-        if not self.number:
-            raise KeyboardInterrupt
-
-    def ended(self, _: object) -> None:
-        """Nothing."""
 
 
 def car(folder: Path, simulation: str, results: str = "", **models: Any) -> System:

@@ -412,9 +412,3 @@ def test_unknown_variables_in_a_slaves_table(settings: dict[str, Any], words: st
     """Parameters may be any variable, tolerances belong to outputs."""
     with pytest.raises(ConfigurationError, match=re.escape(f"car.toml: {words}")):
         resolved(TWO, slaves={"b": settings})
-
-
-def test_a_system_without_outputs_has_nothing_to_control() -> None:
-    """The mean over no outputs is no error norm."""
-    with pytest.raises(ConfigurationError, match="no slave has a continuous real output"):
-        resolved({"a": described("u", "")})

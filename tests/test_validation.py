@@ -218,6 +218,9 @@ CAPABILITIES = {
     "bouncing_ball_me2": replace(HELD, inputs="no continuous inputs"),
     "bouncing_ball_me3": replace(HELD, inputs="no continuous inputs"),
     "relay_me2": replace(WHOLE, outputs="none", states=(("native", AT_REST),)),
+    "drive1": replace(HELD, states=FORKED),
+    "drive2": HELD,
+    "drive3": replace(HELD, zero=UNREACHED),
     "all_types2": HELD,
     "all_types3": replace(HELD, zero=UNREACHED, remark="clock clock (triggered) is ignored"),
 }  # fmt: skip

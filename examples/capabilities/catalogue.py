@@ -699,6 +699,59 @@ def all_types3() -> Fmu:
     )
 
 
+# ---- Drives -------------------------------------------------------------------------------------
+
+MODES = ("Mode", {"reverse": -1, "neutral": 0, "forward": 1, "fast": 5})
+
+
+def drives() -> Iterator[Fmu]:
+    """Variables of every causality: tunable, local and calculated ones, with bounds and items."""
+    variables = (
+        Variable("u", 0, "input", start="0"),
+        Variable(
+            "gain",
+            1,
+            "parameter",
+            start="1",
+            variability="tunable",
+            extra={"min": "0", "max": "10"},
+        ),
+        Variable("y", 2, "output", start="0", initial="exact", depends=()),
+        Variable("flow", 3, "local", derivative="y", depends=("u",)),
+        Variable("s", 4, "local", start="0", initial="exact"),
+        Variable("der(s)", 5, "local", derivative="s", depends=("y",)),
+        Variable("total", 6, "calculatedParameter", variability="tunable"),
+        Variable("ratio", 7, "local"),
+        Variable(
+            "mode",
+            10,
+            "parameter",
+            "Enumeration",
+            start="1",
+            variability="tunable",
+            declared_type="Mode",
+        ),
+        Variable("n", 11, "parameter", "Int32", start="3", extra={"min": "1", "max": "8"}),
+        Variable("is_moving", 12, "local", "Boolean", variability="discrete"),
+        Variable("label", 13, "local", "String", variability="discrete"),
+    )
+    for version in (1, 2, 3):
+        without = ("mode", "total") if version == 1 else ()  # FMI 1.0 has none like these
+        yield make_fmu(
+            Description(
+                name=f"drive{version}",
+                description="Tunable, local and calculated variables, with bounds and items",
+                variables=tuple(v for v in variables if v.name not in without),
+                enumerations=(MODES,),
+                experiment=EXPERIMENT,
+            ),
+            (SOURCES / "drive.c",),
+            version=version,
+            capabilities=Capabilities(saved_states=version > 1, event_mode=version == 3),
+            definitions={"MODE_TYPE": "INT64", "MODE_C": "int64_t"} if version == 3 else {},
+        )
+
+
 def _inputs_and_outputs(pairs: tuple[Variable, ...], state: str) -> Iterator[Variable]:
     for pair in pairs:
         yield replace(pair, name=f"{pair.name}_in", causality="input")
@@ -723,5 +776,6 @@ FMUS = (
     relay(),
     all_types2(),
     all_types3(),
+    *drives(),
 )
 """All FMUs, in the order of the README."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import uuid
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -86,7 +87,8 @@ class Description:
     description: str
     variables: tuple[Variable, ...]
     units: tuple[Unit, ...] = ()
-    enumerations: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    enumerations: tuple[tuple[str, Mapping[str, int] | tuple[str, ...]], ...] = ()
+    """Each with the numbers of its items, or items that are numbered from 1 on."""
     experiment: dict[str, str] = field(default_factory=dict)
     """The attributes of DefaultExperiment."""
     capabilities: dict[str, str] = field(default_factory=dict)
@@ -411,8 +413,10 @@ def _write_units(root: ET.Element, units: tuple[Unit, ...]) -> None:
         ET.SubElement(element, "BaseUnit", unit.base)
 
 
-def _write_items(element: ET.Element, items: tuple[str, ...]) -> None:
-    for value, item in enumerate(items, start=1):
+def _write_items(element: ET.Element, items: Mapping[str, int] | tuple[str, ...]) -> None:
+    if isinstance(items, tuple):
+        items = {item: value for value, item in enumerate(items, start=1)}
+    for item, value in items.items():
         ET.SubElement(element, "Item", name=item, value=str(value))
 
 

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from master_node.numerics.extrapolation import divided_differences
 from protocol.signals import MAX_ORDER, FloatArray
 
-_DEPTH = MAX_ORDER + 2
 _HERMITE_POINTS = 3
+_DEPTH = MAX_ORDER + 3
+"""Points for the polynomial of the highest order, and one to compare it with."""
 
 _STEEP = 10.0
 """Factor by which a jump is above the tolerance, and above what slopes explain."""
@@ -47,12 +48,17 @@ class OutputHistory:
             (time, *self.times[: _DEPTH - 1]), (outputs, *self.outputs[: _DEPTH - 1])
         )
 
+    def can_compare(self, order: int) -> bool:
+        """Whether there is a point more than the polynomials of a step of order k need."""
+        return len(self.times) > max(_HERMITE_POINTS, order + 2)
+
     def at(
         self,
         times: FloatArray,
         order: int,
         has_derivative: NDArray[np.bool_],
         scale: FloatArray | None = None,
+        more: int = 0,
     ) -> FloatArray:
         """The outputs at ``times``, shape (s, m).
 
@@ -62,20 +68,28 @@ class OutputHistory:
             has_derivative: which outputs come with their derivatives, shape (m,); one that lacks
                 its derivative at a newest point is read as those without.
             scale: ATOL_j + RTOL_j |y_j|, shape (m,), unit [y]; None: nothing jumps.
+            more: points beyond those that are needed. Where the result then is another one, the
+                points lie too far apart for what the outputs do between them.
         """
-        has_derivative = self._with_slopes(has_derivative)
+        has_derivative = self._with_slopes(has_derivative, more)
         values = np.empty((len(times), has_derivative.size))
         smooth = np.ones(has_derivative.size, dtype=bool)
         if scale is not None and len(self.times) > 1:
             jumps = self.jumps(has_derivative, scale)
             smooth = np.logical_not(jumps.any(axis=0))
             for j in np.flatnonzero(~smooth):
-                values[:, j] = self._beside_jumps(times, order, int(j), jumps[:, j], has_derivative)
+                values[:, j] = self._beside_jumps(
+                    times, order, int(j), jumps[:, j], has_derivative, more
+                )
         plain, hermite = smooth & ~has_derivative, smooth & has_derivative
         if plain.any():
-            values[:, plain] = self._polynomial(times, order, plain, has_derivative=False)
+            values[:, plain] = self._polynomial(
+                times, order, plain, has_derivative=False, more=more
+            )
         if hermite.any():
-            values[:, hermite] = self._polynomial(times, order, hermite, has_derivative=True)
+            values[:, hermite] = self._polynomial(
+                times, order, hermite, has_derivative=True, more=more
+            )
         return values
 
     def jumps(self, has_derivative: NDArray[np.bool_], scale: FloatArray) -> NDArray[np.bool_]:
@@ -103,13 +117,14 @@ class OutputHistory:
         is_known: NDArray[np.bool_] = steep >= 0.0
         return is_known & (changes > _STEEP * scale) & (changes > _STEEP * sizes * steep)
 
-    def _beside_jumps(
+    def _beside_jumps(  # noqa: PLR0917  those of `at`, and the jumps
         self,
         times: FloatArray,
         order: int,
         output: int,
         jumps: NDArray[np.bool_],
         has_derivative: NDArray[np.bool_],
+        more: int,
     ) -> FloatArray:
         """One output at ``times``, read from the points that no jump divides from them, (s,)."""
         values = np.empty(len(times))
@@ -127,16 +142,18 @@ class OutputHistory:
             while last < len(jumps) and not jumps[last]:
                 last += 1
             beside = OutputHistory(self.times[first : last + 1], self.outputs[first : last + 1])
-            has_slopes = bool(beside._with_slopes(has_derivative)[output])
-            read = beside._polynomial(times[i : i + 1], order, column, has_derivative=has_slopes)
+            has_slopes = bool(beside._with_slopes(has_derivative, more)[output])
+            read = beside._polynomial(
+                times[i : i + 1], order, column, has_derivative=has_slopes, more=more
+            )
             values[i] = read[0, 0]
         return values
 
-    def _with_slopes(self, has_derivative: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _with_slopes(self, has_derivative: NDArray[np.bool_], more: int) -> NDArray[np.bool_]:
         """Outputs with derivatives that have them at all points of a Hermite polynomial, (m,)."""
         if not has_derivative.any():
             return has_derivative
-        known = [np.isfinite(y[1]) for y in self.outputs[:_HERMITE_POINTS]]
+        known = [np.isfinite(y[1]) for y in self.outputs[: _HERMITE_POINTS + more]]
         has_slopes: NDArray[np.bool_] = has_derivative & np.logical_and.reduce(known)
         return has_slopes
 
@@ -147,16 +164,17 @@ class OutputHistory:
         columns: NDArray[np.bool_] | NDArray[np.intp],
         *,
         has_derivative: bool,
+        more: int,
     ) -> FloatArray:
         """Some outputs at ``times``, shape (s, number), by the polynomial through the points."""
         now = self.times[0]
         offsets = [time - now for time in self.times]
         tau = (times - now)[:, np.newaxis]
         if not has_derivative:
-            nodes = offsets[: max(_HERMITE_POINTS, order + 2)]
+            nodes = offsets[: max(_HERMITE_POINTS, order + 2) + more]
             points = [y[0, columns] for y in self.outputs[: len(nodes)]]
             return _newton(nodes, divided_differences(nodes, points), tau)
-        newest = self.outputs[:_HERMITE_POINTS]
+        newest = self.outputs[: _HERMITE_POINTS + more]
         nodes = [offset for offset in offsets[: len(newest)] for _ in range(2)]
         points = [y[0, columns] for y in newest for _ in range(2)]
         slopes = [y[1, columns] for y in newest]

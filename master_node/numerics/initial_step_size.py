@@ -92,4 +92,6 @@ def initial_step_size(
 
 
 def _norm(values: FloatArray, scale: FloatArray) -> float:
+    if not values.size:
+        return 0.0
     return float(np.sqrt(np.mean(np.square(values / scale))))

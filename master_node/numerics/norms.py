@@ -29,14 +29,16 @@ def weighted_rms_norm(error: FloatArray, scale: FloatArray) -> tuple[float, int]
     """ERR = sqrt( mean_j ( EST_j / (ATOL_j + RTOL_j |y_j|) )^2 ), and which j has most of it.
 
     Args:
-        error: EST, shape (m,), unit [y], m >= 1.
+        error: EST, shape (m,), unit [y].
         scale: see `error_scale`, shape (m,), unit [y].
 
     Returns:
         ERR and the index j of the largest part. Anything that is not finite in ``error`` or
         ``scale`` gives infinity and the index of such a value: NaN never passes. NumPy may warn of
-        such values on the way, unless the caller has it ignore them.
+        such values on the way, unless the caller has it ignore them. Without outputs ERR is 0.
     """
+    if not error.size:
+        return 0.0, 0
     weighted = np.abs(error)
     weighted /= scale
     square = weighted.dot(weighted)

@@ -31,7 +31,7 @@ from master_node.results.files import (
 )
 from master_node.results.recording import Recording
 from master_node.results.result import Result
-from master_node.results.selection import SelectedResults, SelectionMemory, check_variables, chosen
+from master_node.results.selection import SelectedResults, SelectionMemory, check_variables
 from master_node.results.steps_file import STEPS_DTYPE
 from master_node.results.summary import summarize
 from master_node.results.writer import ResultsWriter
@@ -51,7 +51,6 @@ __all__ = [
     "SelectedResults",
     "SelectionMemory",
     "check_variables",
-    "chosen",
     "exclusive",
     "finish",
     "is_complete",

@@ -7,6 +7,7 @@ the version and the hash of the settings.
 
 from __future__ import annotations
 
+import json
 import os
 from array import array
 from collections.abc import Iterator, Mapping
@@ -229,6 +230,7 @@ def columns_of(schema: pa.Schema, path: Path) -> Columns:
         tuple(discrete),
         tuple(unit for unit, _ in discrete.values()),
         tuple(type_ for _, type_ in discrete.values()),
+        {field.name: items for field in schema if (items := _items(field))},
     )
 
 
@@ -269,6 +271,8 @@ def _schema(columns: Columns, settings_sha256: str) -> pa.Schema:
         columns.discrete_names, columns.discrete_units, columns.discrete_types, strict=True
     ):
         about = {"unit": unit, "variability": "discrete"}
+        if name in columns.items:
+            about["items"] = json.dumps(columns.items[name])
         fields.append(pa.field(name, _TYPES[type_], nullable=False, metadata=about))
     about = {"doublestep": _version(), "settings_sha256": settings_sha256}
     return pa.schema(fields, metadata=about)
@@ -284,6 +288,16 @@ def _version() -> str:
 def _told(field: pa.Field, key: bytes) -> str:
     about: Mapping[bytes, bytes] = field.metadata or {}
     return about.get(key, b"").decode(errors="replace")
+
+
+def _items(field: pa.Field) -> dict[str, int]:
+    """Of an enumeration the number of each item by its name; empty for others."""
+    try:
+        items = json.loads(_told(field, b"items") or "{}")
+    except ValueError:
+        return {}
+    known = isinstance(items, dict) and all(type(number) is int for number in items.values())
+    return items if known else {}
 
 
 def _type_of(field: pa.Field, path: Path) -> DiscreteType:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, get_args
 
 import numpy as np
@@ -33,6 +33,7 @@ class Columns:
     Attributes:
         names, units: of the m outputs; "" where no unit is known.
         discrete_names, discrete_units, discrete_types: of the d discrete variables.
+        items: of enumerations: the number of each item by its name, by the name of the column.
     """
 
     names: tuple[str, ...]
@@ -40,6 +41,7 @@ class Columns:
     discrete_names: tuple[str, ...] = ()
     discrete_units: tuple[str, ...] = ()
     discrete_types: tuple[DiscreteType, ...] = ()
+    items: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, start: RunStart) -> Columns:
@@ -50,6 +52,7 @@ class Columns:
             start.discrete_names,
             start.discrete_units or ("",) * len(start.discrete_names),
             start.discrete_types,
+            {name: start.items[name] for name in start.discrete_names if name in start.items},
         )
 
     @property
@@ -71,20 +74,29 @@ class Known:
     Attributes:
         units: by name.
         types: of the discrete variables by name; all others are outputs.
+        items: of enumerations by name.
     """
 
     units: Mapping[str, str]
     types: Mapping[str, DiscreteType]
+    items: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, tables: Mapping[str, Any]) -> Known:
         """From ``summary.json``, or what was written at the start in its place."""
-        units, types = tables.get("units"), tables.get("discrete_types")
-        units = units if isinstance(units, Mapping) else {}
-        types = types if isinstance(types, Mapping) else {}
+        units, types, items = (
+            table if isinstance(table := tables.get(key), Mapping) else {}
+            for key in ("units", "discrete_types", "enumerations")
+        )
         return cls(
             {str(name): str(unit) for name, unit in units.items()},
             {str(name): type_ for name, type_ in types.items() if type_ in DISCRETE_TYPES},
+            {
+                str(name): {str(item): int(number) for item, number in numbers.items()}
+                for name, numbers in items.items()
+                if isinstance(numbers, Mapping)
+                and all(type(number) is int for number in numbers.values())
+            },
         )
 
     def columns(self, names: Sequence[str]) -> Columns:
@@ -97,6 +109,7 @@ class Known:
             discrete,
             tuple(self.units.get(name, "") for name in discrete),
             tuple(self.types[name] for name in discrete),
+            {name: self.items[name] for name in discrete if name in self.items},
         )
 
 

@@ -48,6 +48,8 @@ class Result:
             whatever way, and after the master was killed.
         discrete: the discrete variables by name, shape (n,) each: float64, int64, bool, or objects
             that are str or bytes.
+        enumerations: of discrete variables that are enumerations the number of each item by its
+            name.
     """
 
     names: tuple[str, ...]
@@ -57,6 +59,7 @@ class Result:
     steps: NDArray[np.void]
     summary: Mapping[str, Any]
     discrete: Mapping[str, DiscreteArray] = field(default_factory=dict)
+    enumerations: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, table: Table, steps: Steps, summary: Mapping[str, Any]) -> Result:
@@ -70,6 +73,7 @@ class Result:
             steps=steps.to_array(),
             summary=summary,
             discrete=dict(zip(columns.discrete_names, table.discrete, strict=True)),
+            enumerations=columns.items,
         )
 
     def __getitem__(self, name: str) -> NDArray[Any]:
@@ -110,6 +114,16 @@ class Result:
     @cached_property
     def _columns(self) -> dict[str, int]:
         return {name: column for column, name in enumerate(self.names)}
+
+    def item_names(self, name: str) -> NDArray[np.object_]:
+        """The names of an enumeration's items over ``time``, shape (n,); numbers of none as texts.
+
+        Raises:
+            KeyError: the variable is no enumeration whose items are known.
+        """
+        names = {number: item for item, number in self.enumerations[name].items()}
+        numbers = self.discrete[name].tolist()
+        return np.array([names.get(number, str(number)) for number in numbers], dtype=object)
 
     def to_array(self) -> NDArray[np.void]:
         """All rows as a structured array, shape (n,): ``time`` first, then the names."""

@@ -2,56 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from master_node.observers import Attempt, Observer, Point, RunEnd, RunStart
+from master_node.patterns import chosen, is_name, matches
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
 
 
-def check_variables(patterns: Sequence[str], names: Sequence[str], source: str) -> None:
+def check_variables(
+    patterns: Sequence[str], names: Sequence[str], source: str, recorded: Collection[str] = ()
+) -> None:
     """Refuse patterns that do not fit the variables of a system.
 
     Args:
-        patterns: see ``chosen``.
-        names: ``slave.variable`` of all there are.
+        patterns: see `chosen`.
+        names: ``slave.variable`` of the outputs.
         source: what to call the system.
+        recorded: other variables, which results hold in any case.
 
     Raises:
         ConfigurationError: one matches no variable, with the nearest names, or none is left.
     """
+    known = (*names, *recorded)
     for pattern in patterns:
-        if not any(_matches(name, pattern.removeprefix("!")) for name in names):
+        bare = pattern.removeprefix("!")
+        if bare != "*" and not any(matches(name, bare) for name in known):
             raise ConfigurationError(
                 f"{source}: [results] variables: {pattern!r} matches no variable"
-                f"{nearest(pattern.removeprefix('!'), names)}"
+                f"{nearest(bare, known)}",
+                remedy="" if is_name(pattern) else "locals = [...] is for what is no output",
             )
-    if not any(chosen(patterns, names)):
+    if known and not recorded and not any(chosen(patterns, names)):
         raise ConfigurationError(f"{source}: [results] variables leaves no variable")
-
-
-def chosen(patterns: Sequence[str], names: Sequence[str]) -> NDArray[np.bool_]:
-    """Which names match a pattern, and none that begins with ``!``; shape (len(names),).
-
-    ``*`` stands for any text and ``?`` for one character, case counts, and brackets are what they
-    are, as FMI has them in names. Without a pattern to match, all names do.
-    """
-    wanted = [pattern for pattern in patterns if not pattern.startswith("!")] or ["*"]
-    unwanted = [pattern[1:] for pattern in patterns if pattern.startswith("!")]
-    return np.array(
-        [
-            any(_matches(name, pattern) for pattern in wanted)
-            and not any(_matches(name, pattern) for pattern in unwanted)
-            for name in names
-        ],
-        np.bool_,
-    )
 
 
 class SelectionMemory(NamedTuple):
@@ -73,7 +61,7 @@ class SelectedResults:
 
     Args:
         observer: gets what is left.
-        variables: patterns, see ``chosen``.
+        variables: patterns for outputs, see `chosen`.
         every: of the points after the first each ``every``-th is wanted.
         begin: what is remembered of a run that is resumed.
     """
@@ -100,8 +88,8 @@ class SelectedResults:
 
     def started(self, start: RunStart) -> None:
         """Pass on what is chosen of it."""
-        outputs = np.flatnonzero(chosen(self._variables, start.output_names))
-        discrete = np.flatnonzero(chosen(self._variables, start.discrete_names))
+        outputs = self._chosen(start.output_names, start.recorded)
+        discrete = self._chosen(start.discrete_names, start.recorded)
         some_outputs = len(outputs) < len(start.output_names)
         some_discrete = len(discrete) < len(start.discrete_names)
         self._outputs = outputs if some_outputs else None
@@ -121,6 +109,11 @@ class SelectedResults:
                 discrete=tuple(start.discrete[i] for i in discrete),
             )
         )
+
+    def _chosen(self, names: Sequence[str], recorded: frozenset[str]) -> NDArray[np.intp]:
+        """Indices of those that are wanted: recorded variables were chosen already."""
+        is_chosen = chosen(self._variables, names)
+        return np.flatnonzero([c or n in recorded for c, n in zip(is_chosen, names, strict=True)])
 
     def attempted(self, attempt: Attempt) -> None:
         """Pass on with the points that are wanted."""
@@ -152,7 +145,3 @@ class SelectedResults:
         if self._discrete is not None:
             discrete = tuple(discrete[i] for i in self._discrete)
         return Point(time, outputs, discrete)
-
-
-def _matches(name: str, pattern: str) -> bool:
-    return fnmatchcase(name, pattern.replace("[", "[[]"))

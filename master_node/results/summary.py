@@ -21,7 +21,7 @@ def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> d
 
     ``state_kind``, ``do_steps``, ``rollbacks``, ``restarts``, ``requests``, ``compute_time`` [s]
     and ``transport_time`` [s] are maps by slave, ``controlled_by`` by the kind of control,
-    ``units`` and ``discrete_types`` by variable.
+    ``units``, ``discrete_types`` and ``enumerations`` by variable.
     """
     statistics = end.statistics
     simulation = settings.get("simulation")
@@ -76,6 +76,7 @@ def about_columns(columns: Columns, settings: Mapping[str, object]) -> dict[str,
         "not_in_mat": texts if "mat" in formats else [],
         "units": columns.all_units,
         "discrete_types": columns.types,
+        "enumerations": columns.items,
     }
 
 

@@ -11,7 +11,8 @@ from typing import Any
 from master_node.configuration import InputSettings, System
 from master_node.input_loading import load_signals
 from master_node.numerics.reductions import REDUCTIONS_OF_VALUES
-from master_node.results.selection import check_variables, chosen
+from master_node.patterns import chosen
+from master_node.results.selection import check_variables
 from master_node.results.summary import settings_sha256
 from master_node.simulation import settings_of
 from master_node.start_values import start_values
@@ -147,13 +148,17 @@ class _Check:
         return coupled
 
     def _check_outputs(self, coupled: CoupledSystem) -> None:
+        recorded = coupled.recorded
         discrete = dict(zip(coupled.discrete.names, coupled.discrete.types, strict=True))
         names = (*coupled.output_names, *discrete)
+        more = {one.name: one.variable.type for one in recorded.discrete}
+        known = [*(one.name for one in recorded.continuous), *more]
         patterns = self._system.results.variables
-        check_variables(patterns, names, f"{self._study.source}: {self._system.source}")
-        known = [
+        check_variables(patterns, names, f"{self._study.source}: {self._system.source}", known)
+        known += [
             name for name, is_kept in zip(names, chosen(patterns, names), strict=True) if is_kept
         ]
+        discrete |= more
         for name, output in self._study.results.outputs.items():
             where = f"{self._study.source}: [results.outputs.{name}]"
             variable = output.variable

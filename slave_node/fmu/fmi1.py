@@ -21,7 +21,7 @@ from fmpy.fmi1 import (
     fmi1CallbackFunctions,
 )
 
-from protocol.calls import StepResult
+from protocol.calls import RecordedValues, StepResult
 from protocol.errors import StepRejectedError
 from protocol.signals import FloatArray
 from protocol.slave import StartValue, StepStatus, VariableType
@@ -189,6 +189,12 @@ class Fmi1Slave(FmuSlave):
                 return known
             self.exit_initialization_mode()
         return super().get_discrete_outputs()
+
+    def get_recorded_variables(self) -> RecordedValues:
+        """See `Slave`. FMI 1.0 lets nothing be read before the FMU is initialized."""
+        if not self._is_initialized:
+            self.exit_initialization_mode()
+        return super().get_recorded_variables()
 
     def do_step(
         self, communication_point: float, step_size: float, no_set_state_prior: bool

@@ -9,12 +9,14 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 
+from protocol.calls import RecordedValues
 from protocol.errors import SlaveError
 from protocol.signals import MAX_ORDER, FloatArray
 from protocol.slave import Slave, SlaveDescription, StartValue
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.exchange import Buffer
 from slave_node.fmu.instance import FmuInstance
+from slave_node.fmu.recorded_variables import RecordedVariables
 
 
 class FmuSlave(Slave):
@@ -39,6 +41,7 @@ class FmuSlave(Slave):
         self._rows_set = 1
         self._discrete_inputs = instance.discrete(())
         self._discrete_outputs = instance.discrete(())
+        self._recorded = RecordedVariables(instance, ())
 
     def set_inputs(self, derivatives: FloatArray) -> None:
         """See `Slave`. A derivative once set stays set, so those above the order are zeroed."""
@@ -98,6 +101,19 @@ class FmuSlave(Slave):
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """See `Slave`."""
         return self._discrete_outputs.receive()
+
+    def record(self, names: Sequence[str]) -> None:
+        """See `Slave`.
+
+        Raises:
+            ModelError: there is no variable of a name.
+            SlaveError: a variable is of a type that is not exchanged.
+        """
+        self._recorded = RecordedVariables(self._instance, names)
+
+    def get_recorded_variables(self) -> RecordedValues:
+        """See `Slave`."""
+        return self._recorded.values()
 
     def get_state(self) -> object:
         """See `Slave`."""

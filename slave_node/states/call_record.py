@@ -19,6 +19,7 @@ from protocol.calls import (
     ExitInitializationMode,
     GetDiscreteOutputs,
     GetOutputs,
+    GetRecordedVariables,
     Initialize,
     SetDiscreteInputs,
     SetInputs,
@@ -39,6 +40,7 @@ _DO_STEP = 16  # plus no_set_state_prior
 _SET_DISCRETE_INPUTS = 24
 _GET_DISCRETE_OUTPUTS = 25
 _EXIT_INITIALIZATION_MODE = 26
+_GET_RECORDED_VARIABLES = 27
 
 
 class CallRecord:
@@ -79,6 +81,8 @@ class CallRecord:
                 self._discrete.append(values)
             case GetDiscreteOutputs():
                 self._operations.append(_GET_DISCRETE_OUTPUTS)
+            case GetRecordedVariables():
+                self._operations.append(_GET_RECORDED_VARIABLES)
             case ExitInitializationMode():
                 self._operations.append(_EXIT_INITIALIZATION_MODE)
             case _:
@@ -107,6 +111,8 @@ class CallRecord:
                 yield SetDiscreteInputs(next(discrete))
             elif operation == _GET_DISCRETE_OUTPUTS:
                 yield GetDiscreteOutputs()
+            elif operation == _GET_RECORDED_VARIABLES:
+                yield GetRecordedVariables()
             else:
                 yield ExitInitializationMode()
 
@@ -204,5 +210,6 @@ _KNOWN = frozenset(
         _SET_DISCRETE_INPUTS,
         _GET_DISCRETE_OUTPUTS,
         _EXIT_INITIALIZATION_MODE,
+        _GET_RECORDED_VARIABLES,
     }
 )

@@ -27,7 +27,9 @@ from protocol.calls import (
     ExitInitializationMode,
     GetDiscreteOutputs,
     GetOutputs,
+    GetRecordedVariables,
     Initialize,
+    RecordedValues,
     Reset,
     SetDiscreteInputs,
     SetInputs,
@@ -107,6 +109,7 @@ class ForkSlave(Slave):
         self._loads = count()
         self._saved: set[_State] = set()
         self._habits = Habits()
+        self._recorded_names: tuple[str, ...] = ()
         self._load()
 
     def _load(self) -> None:
@@ -284,8 +287,13 @@ class ForkSlave(Slave):
                 tuple(discrete_inputs),
                 tuple(discrete_outputs),
                 early_return,
+                self._recorded_names,
             )
         )
+
+    def record(self, names: Sequence[str]) -> None:
+        """See `Slave`; the holder hears of it with `initialize`."""
+        self._recorded_names = tuple(names)
 
     def exit_initialization_mode(self) -> None:
         """See `Slave`."""
@@ -358,6 +366,12 @@ class ForkSlave(Slave):
             self._discrete_outputs, *_ = self._run(GetDiscreteOutputs())  # type: ignore[assignment]
         assert self._discrete_outputs is not None
         return self._discrete_outputs
+
+    def get_recorded_variables(self) -> RecordedValues:
+        """See `Slave`."""
+        values, *_ = self._run(GetRecordedVariables())
+        assert isinstance(values, RecordedValues)
+        return values
 
     def terminate(self) -> None:
         """See `Slave`."""

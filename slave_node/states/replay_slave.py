@@ -18,7 +18,9 @@ from protocol.calls import (
     ExitInitializationMode,
     GetDiscreteOutputs,
     GetOutputs,
+    GetRecordedVariables,
     Initialize,
+    RecordedValues,
     SetDiscreteInputs,
     SetInputs,
     StepResult,
@@ -63,6 +65,7 @@ class ReplaySlave(Slave):
             remarks=(*described.remarks, REMARK),
         )
         self._record = CallRecord(Initialize())
+        self._recorded: tuple[str, ...] = ()
 
     # ---- Calls that lead to a state -----------------------------------------------------------
 
@@ -102,6 +105,7 @@ class ReplaySlave(Slave):
                 tuple(discrete_inputs),
                 tuple(discrete_outputs),
                 early_return,
+                self._recorded,
             )
         )
 
@@ -140,6 +144,17 @@ class ReplaySlave(Slave):
         outputs = self._slave.get_discrete_outputs()
         self._record.add(GetDiscreteOutputs())
         return outputs
+
+    def record(self, names: Sequence[str]) -> None:
+        """See `Slave`."""
+        self._slave.record(names)
+        self._recorded = tuple(names)
+
+    def get_recorded_variables(self) -> RecordedValues:
+        """See `Slave`; as `get_outputs`."""
+        values = self._slave.get_recorded_variables()
+        self._record.add(GetRecordedVariables())
+        return values
 
     # ---- Saved states -------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NoReturn
 
-from protocol.calls import StepResult
+from protocol.calls import RecordedValues, StepResult
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
 from protocol.slave import Slave, StartValue, StateKind
@@ -77,6 +77,14 @@ class StatelessSlave(Slave):
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """See `Slave`."""
         return self._slave.get_discrete_outputs()
+
+    def record(self, names: Sequence[str]) -> None:
+        """See `Slave`."""
+        self._slave.record(names)
+
+    def get_recorded_variables(self) -> RecordedValues:
+        """See `Slave`."""
+        return self._slave.get_recorded_variables()
 
     def _refuse(self) -> NoReturn:
         raise SlaveError(

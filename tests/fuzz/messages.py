@@ -26,8 +26,10 @@ from protocol.calls import (
     FreeState,
     GetDiscreteOutputs,
     GetOutputs,
+    GetRecordedVariables,
     GetState,
     Initialize,
+    RecordedValues,
     Reply,
     Reset,
     SerializeState,
@@ -73,6 +75,7 @@ PROGRAMS: tuple[tuple[Call, ...], ...] = (
     (SetState(1), SetInputs(_INPUT[:1]), DoStep(0.01, 0.01, True), GetOutputs()),
     (SetState(0, True), FreeState(1), SerializeState(0), DeserializeState(2, bytes(24))),
     (SetDiscreteInputs((1, True, "text", b"\0", 0.5)), GetDiscreteOutputs()),
+    (DoStep(0.0, 0.01), GetOutputs(), GetRecordedVariables()),
     (Examine(0.0, 0.01, 1e-4, 1e-4),),
     (Terminate(), Reset()),
 )
@@ -90,6 +93,10 @@ REPLIES: tuple[tuple[tuple[Call, ...], Reply], ...] = (
     (
         (SerializeState(0), GetDiscreteOutputs(), Examine(0.0, 0.01)),
         Reply([b"state", (1, "x", True), Examination()], None, 1e-3),
+    ),
+    (
+        (GetRecordedVariables(),),
+        Reply([RecordedValues(np.array([[0.5, 1.5]]), (3, "x", True))], None, 1e-3),
     ),
 )
 
