@@ -24,6 +24,7 @@ from protocol.standard_error import forgive_standard_error
 from protocol.standard_output import guarded_standard_output, output_of_others
 from protocol.terminal import say, say_error, say_json
 from protocol.threads import start_thread
+from protocol.toml_text import assigned_values
 
 if TYPE_CHECKING:  # each command imports what it needs
     from master_node.observers import Observer
@@ -130,6 +131,9 @@ def run(  # noqa: PLR0917  options of the command line
     case: Annotated[
         Path | None, typer.Option(help="Parameters of a run of a study, its case.toml.")
     ] = None,
+    parameter: Annotated[
+        list[str] | None, typer.Option(help="Start value, slave.variable=value; may be repeated.")
+    ] = None,
     state: Annotated[
         str | None,
         typer.Option(help="How all slaves save their states: native, fork, replay or none."),
@@ -200,6 +204,7 @@ def run(  # noqa: PLR0917  options of the command line
         opened = stack.enter_context(open_system(system_file, package_bus=package_bus))
         system = (
             (opened if case is None else apply_case(opened, read_case(case)))
+            .with_parameters(assigned_values("--parameter", parameter or ()))
             .with_simulation(
                 preset=preset,
                 order=_order(order),

@@ -36,10 +36,11 @@ from master_node.outputs import Outputs
 from master_node.run_context import RunContext
 from master_node.run_warnings import warnings_of
 from master_node.slave_group import SlaveGroup
-from master_node.system import CoupledSystem
+from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import Terminate
 from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
-from protocol.slave import VariableType
+from protocol.names import listed
+from protocol.slave import Causality, VariableType
 
 log = logging.getLogger("master_node")
 
@@ -64,6 +65,7 @@ def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
     warnings = []
     for part in coupled.parts:
         warnings += [f"{part.name}: {remark}" for remark in part.description.remarks]
+        warnings += _local_sources(part)
         can = part.description.capabilities
         fixed = system.slaves[part.name].step_size or part.description.fixed_step_size
         if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:
@@ -113,6 +115,19 @@ def _not_iterated(coupled: CoupledSystem, system: System) -> list[str]:
             f"those of {held[0]} do not: inputs are extrapolated; leave out input_substeps = 1"
         ]
     return []
+
+
+def _local_sources(part: SlavePart) -> list[str]:
+    """What feeds inputs and is not meant for other models."""
+    locals_ = [
+        name for name in part.locals if part.description.variable(name).causality is Causality.LOCAL
+    ]
+    if not locals_ or part.description.kind == "Python model":
+        return []
+    return [
+        f"{part.name}: inputs are fed by its local variables {listed(locals_)}: FMI means only "
+        "outputs for other models"
+    ]
 
 
 def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:

@@ -93,12 +93,18 @@ def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:
     return value
 
 
+MappingEntries = Mapping[bool, bool] | Mapping[int | str, int | str]
+"""What becomes of values: booleans, or integers and items of enumerations."""
+
 _BOOLEAN_KEYS = {"true": True, "false": False}
 
 
-def _mapping(value: Any) -> Mapping[bool, bool] | Mapping[int, int]:
+def _mapping(value: Any) -> MappingEntries:
     """The entries of a mapping; keys of TOML are texts."""
-    wrong = ValueError("write { false = true, … } or { 1 = 2, … }: booleans, or whole numbers")
+    wrong = ValueError(
+        "write { false = true, … } or { 1 = 2, … }: booleans, or whole numbers and items of "
+        "enumerations"
+    )
     if not isinstance(value, Mapping) or not value:
         raise wrong
     entries: dict[Any, Any] = {}
@@ -110,7 +116,7 @@ def _mapping(value: Any) -> Mapping[bool, bool] | Mapping[int, int]:
             raise ValueError(f"{key} is there twice")
         entries[source] = target
     kinds = {type(entry) for pair in entries.items() for entry in pair}
-    if kinds not in ({bool}, {int}):
+    if kinds != {bool} and not kinds <= {int, str}:
         raise wrong
     return entries
 
@@ -401,6 +407,8 @@ class SlaveSettings(_Table):
         output_derivatives: names of the outputs whose derivatives may be used; default: of all,
             where the model gives any.
         uncontrolled: names of the outputs that do not count in ERR.
+        ignore_bounds: take values beyond the ``min`` and ``max`` of its variables, and numbers that
+            no item of an enumeration has.
     """
 
     model: StrictStr | None = None
@@ -423,6 +431,7 @@ class SlaveSettings(_Table):
     state: Literal["native", "fork", "replay", "none"] | None = None
     output_derivatives: tuple[StrictStr, ...] | None = None
     uncontrolled: tuple[StrictStr, ...] = ()
+    ignore_bounds: StrictBool = False
 
     @model_validator(mode="after")
     def _agent_needs_model(self) -> Self:
@@ -443,7 +452,7 @@ class Connection(_Table):
         factor, offset: input = factor * output + offset, in place of a conversion of units.
         ignore_units: hand the value on as it is, whatever the units.
         mapping: what becomes of single values of an output that is a boolean, an integer or an
-            enumeration; others are handed on as they are. All are booleans, or all integers.
+            enumeration; others are handed on as they are. All are booleans, or integers and items.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
@@ -453,21 +462,21 @@ class Connection(_Table):
     factor: Number | None = None
     offset: Number | None = None
     ignore_units: StrictBool = False
-    mapping: Mapping[bool, bool] | Mapping[int, int] | None = None
+    mapping: MappingEntries | None = None
 
     @field_validator("mapping", mode="plain")
     @classmethod
-    def _entries(
-        cls, value: Any, info: ValidationInfo
-    ) -> Mapping[bool, bool] | Mapping[int, int] | None:
+    def _entries(cls, value: Any, info: ValidationInfo) -> MappingEntries | None:
         beside = [key for key in ("factor", "offset", "ignore_units") if info.data.get(key)]
         if value is not None and beside:
             raise ValueError(f"cannot stand beside {beside[0]}")
         return None if value is None else _mapping(value)
 
     @field_serializer("mapping")
-    def _as_table(self, value: Mapping[int, int] | None) -> dict[str, int] | None:
-        return None if value is None else {str(key).lower(): v for key, v in value.items()}
+    def _as_table(self, value: MappingEntries | None) -> dict[str, int | str] | None:
+        if value is None:
+            return None
+        return {key if isinstance(key, str) else str(key).lower(): v for key, v in value.items()}
 
     @model_validator(mode="before")
     @classmethod

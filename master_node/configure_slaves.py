@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 from master_node.configuration import System
 from master_node.slave_group import Program, SlaveGroup
 from master_node.slave_link import SlaveLink
-from master_node.start_values import structural_parameters
+from master_node.start_values import structural_values
 from protocol.calls import Configure
 from protocol.slave import SlaveDescription
 
@@ -29,6 +30,7 @@ def configure(
         What each slave says of itself from now on.
 
     Raises:
+        ConfigurationError: a value is none of a structural parameter.
         ModelError: a model cannot be run so.
         DoublestepError: a slave cannot be reached.
     """
@@ -59,16 +61,20 @@ def configuration(slave: str, system: System, description: SlaveDescription) -> 
         slave: its name.
         system: the settings.
         description: of the slave, for its structural parameters.
+
+    Raises:
+        ConfigurationError: a value is none of a structural parameter.
     """
     settings = system.slaves[slave]
     largest = settings.largest_substep
     return Configure(
         state_kind=settings.state or "",
-        structural_parameters={
-            name: value
-            for name, value in settings.parameters.items()
-            if name in structural_parameters(description) and not isinstance(value, tuple)
-        },
+        structural_parameters=structural_values(
+            description,
+            settings.parameters,
+            partial(system.places.parameter, slave),
+            ignores_bounds=settings.ignore_bounds,
+        ),
         largest_substep=None if largest is None else float(largest),
         input_substeps=settings.input_substeps,
     )

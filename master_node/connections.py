@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from master_node.configuration import Connection, System
+from master_node.configuration import Connection, MappingEntries, System
 from master_node.type_casts import Cast, cast, mapped_cast
 from master_node.units import (
     IDENTITY,
@@ -17,9 +17,13 @@ from master_node.units import (
 )
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
-from protocol.slave import Causality, SlaveDescription, Variable
+from protocol.slave import Causality, SlaveDescription, Variable, VariableType
+from protocol.values import type_in_words
 
 log = logging.getLogger("master_node")
+
+_SOURCES = (Causality.OUTPUT, Causality.LOCAL, Causality.CALCULATED_PARAMETER)
+"""What can feed an input: all that a model computes."""
 
 Descriptions = Mapping[str, SlaveDescription]
 
@@ -145,7 +149,8 @@ def _connection(
 ) -> ScalarConnection:
     types = source.variable.type, target.variable.type
     if connection.mapping is not None:
-        mapped = mapped_cast(source.variable, target.variable, connection.mapping)
+        entries = _numbered(where, connection.mapping, source, target)
+        mapped = mapped_cast(source.variable, target.variable, entries)
         if mapped is None:
             raise ConfigurationError(
                 f"{where}: mapping: {source.reference} is of type {types[0]}, {target.reference} "
@@ -167,6 +172,23 @@ def _connection(
             f"type {types[0]}, {target.reference} of type {types[1]}"
         )
     return ScalarConnection(source, target, transformation, how)
+
+
+def _numbered(
+    where: str, mapping: MappingEntries, source: End, target: End
+) -> Mapping[bool, bool] | Mapping[int, int]:
+    """The entries with the numbers of items in place of their names."""
+
+    def number(end: End, entry: int | str) -> int:
+        items = end.variable.items
+        if isinstance(entry, str) and entry not in items:
+            raise ConfigurationError(
+                f"{where}: mapping: {end.reference} is of type {type_in_words(end.variable)}, and "
+                f"has no item {entry!r}{nearest(entry, items)}"
+            )
+        return items[entry] if isinstance(entry, str) else entry
+
+    return {number(source, one): number(target, other) for one, other in mapping.items()}
 
 
 def _transformation(
@@ -207,11 +229,11 @@ def _elements(
     """The scalar variables of both ends, one to one; ``words``: what to call the ends."""
     sources = finder.find(where, words[0], connection.source)
     targets = finder.find(where, words[1], connection.target)
-    for key, reference, ends, wanted in (
-        (words[0], connection.source, sources, Causality.OUTPUT),
-        (words[1], connection.target, targets, Causality.INPUT),
+    for key, reference, ends, allowed in (
+        (words[0], connection.source, sources, _SOURCES),
+        (words[1], connection.target, targets, (Causality.INPUT,)),
     ):
-        _check_causality(where, f"{key} = {reference!r}", ends[0], wanted, finder)
+        _check_causality(where, f"{key} = {reference!r}", ends[0], allowed, finder)
     shapes = [_indices(ends) for ends in (sources, targets)]
     if shapes[0] != shapes[1]:
         raise ConfigurationError(
@@ -233,12 +255,35 @@ def _size(ends: list[End]) -> str:
 
 
 def _check_causality(
-    where: str, reference: str, end: End, wanted: Causality, finder: VariableFinder
+    where: str,
+    reference: str,
+    end: End,
+    allowed: tuple[Causality, ...],
+    finder: VariableFinder,
 ) -> None:
     slave, variable = end
-    if variable.causality is not wanted:
-        names = [v.name for v in finder.descriptions[slave].of(wanted)]
+    if variable.causality not in allowed:
+        names = [v.name for v in finder.descriptions[slave].of(allowed[0])]
         raise ConfigurationError(
-            f"{where}: {reference} is not an {wanted} but of causality "
+            f"{where}: {reference} is not an {allowed[0]} but of causality "
             f"{variable.causality}{nearest(variable.name, names)}"
         )
+
+
+def read_variables(
+    descriptions: Descriptions, connections: Sequence[ScalarConnection]
+) -> dict[str, tuple[Variable, ...]]:
+    """What is read of each slave at communication points: outputs, and other sources.
+
+    In the order of its variables; clocks carry no value.
+    """
+    sources = {connection.source.key for connection in connections}
+    return {
+        slave: tuple(
+            variable
+            for variable in description.variables
+            if variable.type is not VariableType.CLOCK
+            and (variable.causality is Causality.OUTPUT or (slave, variable.name) in sources)
+        )
+        for slave, description in descriptions.items()
+    }

@@ -142,7 +142,7 @@ class CouplingScheme:
 
 def _used_derivatives(part: SlavePart, system: System) -> list[bool]:
     """For each output of a slave whether its derivative may be used."""
-    if not part.description.capabilities.max_output_derivative_order:
+    if not part.max_output_derivative_order:
         return [False] * len(part.outputs)
     given = system.slaves[part.name].output_derivatives
     return [given is None or name in given for name in part.outputs]

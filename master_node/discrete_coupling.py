@@ -17,7 +17,7 @@ from master_node.type_casts import Cast, ItemCast
 from master_node.units import Transformation
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
-from protocol.slave import Causality, SlaveDescription, StartValue, VariableType
+from protocol.slave import StartValue, Variable, VariableType
 
 DiscreteValues = tuple[StartValue, ...]
 """Values of the discrete outputs, then of the recorded variables; None stands for one that was not
@@ -190,7 +190,7 @@ class DiscreteCoupling:
 
 
 def couple_discrete(
-    descriptions: Mapping[str, SlaveDescription],
+    read: Mapping[str, Sequence[Variable]],
     feeding: Sequence[Sequence[ScalarConnection]],
     continuous_outputs: Mapping[tuple[str, str], int],
     driven: Sequence[Sequence[DrivenInput]],
@@ -198,7 +198,7 @@ def couple_discrete(
     """Give every discrete output its index.
 
     Args:
-        descriptions: of all slaves, in order.
+        read: the variables of each slave that are read, in order.
         feeding: for each slave the connections of its discrete inputs, in order.
         continuous_outputs: indices of the continuous outputs by slave and variable.
         driven: for each slave its inputs that change from outside, in order.
@@ -207,8 +207,8 @@ def couple_discrete(
     types: list[VariableType] = []
     units: list[str] = []
     slices = []
-    for slave, description in descriptions.items():
-        outputs = [v for v in description.of(Causality.OUTPUT) if v.is_discrete]
+    for slave, variables in read.items():
+        outputs = [v for v in variables if v.is_discrete]
         slices.append(slice(len(keys), len(keys) + len(outputs)))
         keys += [(slave, variable.name) for variable in outputs]
         types += [variable.type for variable in outputs]

@@ -6,10 +6,8 @@ changes, and at the breakpoints of a function, there is a communication point.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite, ulp
-from sys import float_info
 from typing import Any
 
 import numpy as np
@@ -19,11 +17,10 @@ from master_node.external_inputs import Jump, SignalFunction, beside_breakpoint
 from master_node.numerics.input_tables import Table
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
-from protocol.slave import StartValue, Variable, VariableType
+from protocol.slave import StartValue, Variable
+from protocol.values import checked_value, parsed
 
 _INSIDE = 8.0
-_LARGEST_FLOAT = {VariableType.FLOAT32: float(np.finfo(np.float32).max)}
-_TRUTH: dict[object, bool] = {"true": True, "false": False, 0: False, 1: True}
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +31,13 @@ class HoldRows:
         times: increasing, shape (n,) [s].
         values: as they were given: numbers, booleans or texts, shape (n,).
         numbers: the same as a table of numbers; None where not all of them are.
+        unit: of the values, as their file says; "" where it says none.
     """
 
     times: FloatArray
     values: NDArray[Any]
     numbers: Table | None
+    unit: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +74,13 @@ class HeldFunction:
         slave: of the input.
         variable: the input.
         signal: the function.
+        ignores_bounds: take values that the model excludes for the input.
     """
 
     slave: str
     variable: Variable
     signal: SignalFunction
+    ignores_bounds: bool = False
 
     def at(self, time: float) -> StartValue:
         """The value at ``time`` [s], behind a breakpoint there.
@@ -95,10 +96,9 @@ class HeldFunction:
             reason = f"the function of {name} failed: {type(error).__name__}: {error}"
             raise self._error(reason, time) from error
         try:
-            return legal_value(self.variable, given)
-        except ValueError:
-            reason = f"{name} is of type {self.variable.type} and cannot be {given!r:.80}"
-            raise self._error(reason, time) from None
+            return legal_value(self.variable, given, ignores_bounds=self.ignores_bounds)
+        except ValueError as error:
+            raise self._error(f"{name} {error}", time) from None
 
     @property
     def changes(self) -> tuple[float, ...]:
@@ -135,83 +135,45 @@ class DrivenInput:
         return [Jump(time, self.name, is_held=True) for time in self.signal.changes]
 
 
-def driven_input(slave: str, variable: Variable, signal: HoldRows | SignalFunction) -> DrivenInput:
-    """An input with its signal.
+def driven_input(
+    slave: str,
+    variable: Variable,
+    signal: HoldRows | SignalFunction,
+    *,
+    ignores_bounds: bool = False,
+) -> DrivenInput:
+    """An input, or a tunable parameter, with its signal.
 
     Raises:
+        BoundsError: the model excludes the value of a row, unless ``ignores_bounds``.
         ValueError: a row has no value of the input's type; the message says which.
     """
     if isinstance(signal, SignalFunction):
         # A real one changes all the time, and what it does in between is what a sample leaves out.
         is_searched = not variable.type.is_real
-        function = HeldFunction(slave, variable, signal)
+        function = HeldFunction(slave, variable, signal, ignores_bounds)
         return DrivenInput(slave, variable.name, function, is_searched)
     values = []
     for row, given in enumerate(signal.values, 1):
         try:
-            values.append(legal_value(variable, given))
-        except ValueError:
-            shown = given.item() if isinstance(given, np.generic) else given
-            raise ValueError(
-                f"row {row}: it is of type {variable.type} and cannot be {shown!r:.80}"
-            ) from None
+            values.append(legal_value(variable, given, ignores_bounds=ignores_bounds))
+        except ValueError as error:
+            raise type(error)(f"row {row}: it {error}") from None
     table = HeldTable(signal.times, tuple(values))
     return DrivenInput(slave, variable.name, table, is_searched=False)
 
 
-def legal_value(variable: Variable, given: object) -> StartValue:
+def legal_value(variable: Variable, given: object, *, ignores_bounds: bool = False) -> StartValue:
     """A value out of a table, or of a function, as one of a variable's type.
 
-    Texts are read as what the type asks for: numbers, ``true`` and ``false``, hexadecimal digits of
-    a binary. 0 and 1 are booleans, 3.0 is an integer; nothing is rounded.
-
     Raises:
-        ValueError: it is none.
+        BoundsError: the model excludes it, unless ``ignores_bounds``.
+        ValueError: it is none, or not finite.
     """
     value = given.item() if isinstance(given, np.generic) else given
-    if variable.type is VariableType.STRING:
-        return _of_type(value, str)
-    if variable.type is VariableType.BINARY:
-        return bytes.fromhex(value) if isinstance(value, str) else _of_type(value, bytes)
-    if variable.type is VariableType.BOOLEAN:
-        return _boolean(value)
     if isinstance(value, str):
-        value = _number(value)
-    if type(value) is float and not isfinite(value):
-        raise ValueError
-    if type(value) not in (int, float):
-        raise ValueError
-    assert isinstance(value, int | float)
-    if variable.type.is_real:
-        largest_number = _LARGEST_FLOAT.get(variable.type, float_info.max)
-        if abs(value) > largest_number:
-            raise ValueError
-        return float(value)
-    if variable.type.integer_range is None or value != int(value):
-        raise ValueError
-    smallest, largest = variable.type.integer_range
-    if not smallest <= value <= largest:
-        raise ValueError
-    return int(value)
-
-
-def _of_type(value: object, kind: Callable[..., StartValue]) -> StartValue:
-    if type(value) is not kind:
-        raise ValueError
-    return value  # type: ignore[return-value]
-
-
-def _boolean(value: object) -> bool:
-    key = value.strip().lower() if isinstance(value, str) else value
-    if isinstance(key, str) and key not in _TRUTH:
-        key = _number(key)
-    if not isinstance(key, str | int | float) or key not in _TRUTH:
-        raise ValueError
-    return _TRUTH[key]
-
-
-def _number(text: str) -> int | float:
-    try:
-        return int(text)
-    except ValueError:
-        return float(text)
+        value = parsed(variable, value)
+    value = checked_value(variable, value, ignores_bounds=ignores_bounds)
+    if isinstance(value, float) and not isfinite(value):
+        raise ValueError(f"is of type {variable.type}; it cannot be {value!r}")
+    return value

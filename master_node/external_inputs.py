@@ -19,6 +19,8 @@ from master_node.numerics.input_tables import Table, group_tables
 from master_node.numerics.step_polynomials import Quadrature, step_polynomial
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import MAX_ORDER, FloatArray, InputSignal
+from protocol.slave import Variable
+from protocol.values import beyond_bounds
 
 _INSIDE = 8.0
 
@@ -50,6 +52,7 @@ class ExternalInput(NamedTuple):
         signal: that drives it.
         max_order: highest degree of polynomial that its slave takes.
         absolute_tolerance, relative_tolerance: a jump within them is none.
+        bounded: the input whose bounds a function must keep; None: it need not.
     """
 
     slave: str
@@ -58,6 +61,7 @@ class ExternalInput(NamedTuple):
     max_order: int
     absolute_tolerance: float
     relative_tolerance: float
+    bounded: Variable | None = None
 
     @property
     def name(self) -> str:
@@ -245,7 +249,7 @@ def _value(one: ExternalInput, signal: SignalFunction, time: float) -> float:
 
     Raises:
         StepRejectedError: it is not finite, or the function has no value there.
-        SlaveError: the function failed otherwise.
+        SlaveError: the function failed otherwise, or left the bounds of the input.
     """
     try:
         value = float(signal.function(time))
@@ -264,6 +268,15 @@ def _value(one: ExternalInput, signal: SignalFunction, time: float) -> float:
     if not isfinite(value):
         raise StepRejectedError(
             f"{one.name} is {value!r} at t={time!r} s", slave=one.slave, phase="external input"
+        )
+    problem = "" if one.bounded is None else beyond_bounds(one.bounded, value)
+    if problem:
+        raise SlaveError(
+            f"{one.name} {problem}",
+            slave=one.slave,
+            phase="external input",
+            time=time,
+            remedy="correct the function, or say ignore_bounds = true in the table of the slave",
         )
     return value
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -10,7 +11,9 @@ from master_node.connections import End, ScalarConnection, VariableFinder
 from master_node.discrete_inputs import DrivenInput, HoldRows, driven_input
 from master_node.external_inputs import ExternalInput, Signal, SignalFunction
 from master_node.numerics.input_tables import Table
+from master_node.start_values import IGNORE_BOUNDS
 from master_node.tolerances import tolerance
+from master_node.units import UnitMismatchError, UnknownUnitError, conversion
 from protocol.errors import ConfigurationError, SlaveError
 from protocol.names import nearest
 from protocol.signals import MAX_ORDER
@@ -20,8 +23,10 @@ from protocol.slave import (
     SlaveDescription,
     StartValue,
     Variable,
-    VariableType,
 )
+from protocol.values import BoundsError, checked_value
+
+log = logging.getLogger("master_node")
 
 GivenSignal = StartValue | Table | HoldRows | SignalFunction
 """A constant, a table or a function."""
@@ -35,8 +40,9 @@ class SlaveExternals(NamedTuple):
 
     Attributes:
         continuous: in the order of its variables.
-        held: constants for its discrete inputs, by name.
-        driven: its discrete inputs that change, in the order of its variables.
+        held: constants for its discrete inputs and tunable parameters, by name.
+        driven: its discrete inputs and tunable parameters that change, in the order of its
+            variables.
     """
 
     continuous: list[ExternalInput]
@@ -59,54 +65,98 @@ def resolve_external(
         signals: what drives which input.
 
     Raises:
-        ConfigurationError: a name, causality or type is wrong, or an input is driven twice.
+        ConfigurationError: a name, causality, type or value is wrong, or an input is driven twice.
     """
     where = f"{system.source}: [inputs]"
     feeding = {connection.target.key: connection.source for connection in connections}
     found: dict[str, dict[str, ExternalInput]] = {name: {} for name in finder.descriptions}
     held: dict[str, dict[str, StartValue]] = {name: {} for name in finder.descriptions}
     driven: dict[str, dict[str, DrivenInput]] = {name: {} for name in finder.descriptions}
-    start = float(system.simulation.start_time)
-    for reference, signal in signals.items():
+    for reference, given in signals.items():
         for end in finder.find(where, "key", reference):
             slave, variable = end
             description = finder.descriptions[slave]
-            if variable.causality is not Causality.INPUT:
-                inputs = [v.name for v in description.of(Causality.INPUT)]
-                raise ConfigurationError(
-                    f"{where}: {reference} is not an input but of causality "
-                    f"{variable.causality}{nearest(variable.name, inputs)}"
-                )
+            if not can_be_driven(variable):
+                raise _not_driven(where, reference, variable, description)
             if end.key in feeding:
                 raise ConfigurationError(
                     f"{where}: {reference} is driven twice: by {feeding[end.key].reference} and "
                     "from here"
                 )
-            if not variable.is_continuous_real:
-                if isinstance(signal, Table | HoldRows | SignalFunction):
-                    driven[slave][variable.name] = _driven(where, reference, end, signal, start)
+            try:
+                signal = _in_unit_of(where, end, given, description)
+                if variable.is_continuous_real:
+                    found[slave][variable.name] = _continuous(system, end, signal, description)
+                elif isinstance(signal, Table | HoldRows | SignalFunction):
+                    driven[slave][variable.name] = _driven(system, end, signal)
                 else:
-                    held[slave][variable.name] = _constant(where, reference, variable, signal)
-                continue
-            found[slave][variable.name] = ExternalInput(
-                slave,
-                variable.name,
-                _driving(where, reference, variable, signal, start),
-                max_order(description),
-                *tolerance(system, slave, variable),
-            )
+                    held[slave][variable.name] = checked_value(
+                        variable, signal, ignores_bounds=system.slaves[slave].ignore_bounds
+                    )
+            except ValueError as error:
+                remedy = IGNORE_BOUNDS if isinstance(error, BoundsError) else ""
+                raise ConfigurationError(f"{where}: {reference} {error}", remedy=remedy) from None
     return {
         name: SlaveExternals(
-            [found[name][v.name] for v in description.of(Causality.INPUT) if v.name in found[name]],
+            [found[name][v.name] for v in description.variables if v.name in found[name]],
             held[name],
-            [
-                driven[name][v.name]
-                for v in description.of(Causality.INPUT)
-                if v.name in driven[name]
-            ],
+            [driven[name][v.name] for v in description.variables if v.name in driven[name]],
         )
         for name, description in finder.descriptions.items()
     }
+
+
+def can_be_driven(variable: Variable) -> bool:
+    """Whether a variable can be given values while a run goes on."""
+    is_tunable = variable.causality is Causality.PARAMETER and variable.variability == "tunable"
+    return variable.causality is Causality.INPUT or is_tunable
+
+
+def _not_driven(
+    where: str, reference: str, variable: Variable, description: SlaveDescription
+) -> ConfigurationError:
+    if variable.causality is Causality.PARAMETER:
+        return ConfigurationError(
+            f"{where}: {reference} is a {variable.variability} parameter, and only inputs and "
+            "tunable parameters can change while a run goes on",
+            remedy="give its value in `parameters` in the table of the slave",
+        )
+    names = [v.name for v in description.variables if can_be_driven(v)]
+    return ConfigurationError(
+        f"{where}: {reference} is neither an input nor a tunable parameter but of causality "
+        f"{variable.causality}{nearest(variable.name, names)}"
+    )
+
+
+def _in_unit_of(
+    where: str, end: End, signal: GivenSignal, description: SlaveDescription
+) -> GivenSignal:
+    """The signal in the unit of its variable, if it is a table with another one.
+
+    Raises:
+        ValueError: the units measure different things.
+    """
+    variable = end.variable
+    if not isinstance(signal, Table | HoldRows) or not (signal.unit and variable.type.is_real):
+        return signal
+    units = description.units
+    try:
+        change = conversion(signal.unit, units, variable.unit, units)
+    except UnitMismatchError as error:
+        raise ValueError(f"has another unit than the column of its table: {error}") from None
+    except UnknownUnitError as error:
+        log.warning(
+            "%s: the units of %s and of its table are not compared: %s", where, end.reference, error
+        )
+        return signal
+    if change.is_identity:
+        return signal
+    if isinstance(signal, Table):
+        return signal.transformed(*change)
+    if signal.numbers is None:
+        return signal
+    values = signal.values.astype(float) * change.factor + change.offset
+    return HoldRows(signal.times, values, signal.numbers.transformed(*change))
 
 
 def max_order(description: SlaveDescription) -> int:
@@ -114,77 +164,61 @@ def max_order(description: SlaveDescription) -> int:
     return 0 if description.input_derivatives is InputDerivatives.NONE else MAX_ORDER
 
 
-def _driving(
-    where: str, reference: str, variable: Variable, signal: GivenSignal, start: float
-) -> Signal:
+def _continuous(
+    system: System, end: End, signal: GivenSignal, description: SlaveDescription
+) -> ExternalInput:
+    """A continuous input with the signal that drives it.
+
+    Raises:
+        ValueError: a value is none of the input.
+    """
+    slave, variable = end
+    ignores_bounds = system.slaves[slave].ignore_bounds
+    return ExternalInput(
+        slave,
+        variable.name,
+        _driving(variable, signal, float(system.simulation.start_time), ignores_bounds),
+        max_order(description),
+        *tolerance(system, slave, variable),
+        None if ignores_bounds or not variable.has_bounds else variable,
+    )
+
+
+def _driving(variable: Variable, given: GivenSignal, start: float, ignores_bounds: bool) -> Signal:
     """The signal of a continuous input."""
-    if isinstance(signal, HoldRows):
-        if signal.numbers is None:
-            raise ConfigurationError(
-                f"{where}: {reference} is of type {variable.type}, and not all values of its table "
-                "are numbers"
-            )
-        return signal.numbers
+    signal = given.numbers if isinstance(given, HoldRows) else given
+    if signal is None:
+        raise ValueError(f"is of type {variable.type}, and not all values of its table are numbers")
+    if isinstance(signal, Table):
+        for value in signal.extremes:
+            checked_value(variable, value, ignores_bounds=ignores_bounds)
+        return signal
     if isinstance(signal, SignalFunction):
         value = signal.function(start)
-        if isinstance(value, str | bytes):
-            raise _mismatch(where, reference, variable, value)
+        is_number = not isinstance(value, bool | str | bytes)
+        checked_value(variable, float(value) if is_number else value, ignores_bounds=ignores_bounds)
         return signal
-    if isinstance(signal, Table):
-        return signal
-    if isinstance(signal, bool | str | bytes):
-        raise _mismatch(where, reference, variable, signal)
-    return float(signal)
+    return float(checked_value(variable, signal, ignores_bounds=ignores_bounds))
 
 
-def _driven(
-    where: str,
-    reference: str,
-    end: End,
-    signal: Table | HoldRows | SignalFunction,
-    start: float,
-) -> DrivenInput:
-    """A discrete input with the signal that changes it."""
+def _driven(system: System, end: End, signal: Table | HoldRows | SignalFunction) -> DrivenInput:
+    """A discrete input, or a tunable parameter, with the signal that changes it.
+
+    Raises:
+        ConfigurationError: the signal is a function that fails, or has values between its rows.
+        ValueError: a value is none of the input.
+    """
     slave, variable = end
     if isinstance(signal, Table):
         raise ConfigurationError(
-            f"{where}: {reference} is a {variable.variability} variable of type {variable.type}: "
-            "nothing lies between the rows of its table",
+            f"{system.source}: [inputs]: {end.reference} is a {variable.variability} variable of "
+            f"type {variable.type}: nothing lies between the rows of its table",
             remedy='say interpolation = "hold"',
         )
+    ignores_bounds = system.slaves[slave].ignore_bounds
+    driven = driven_input(slave, variable, signal, ignores_bounds=ignores_bounds)
     try:
-        driven = driven_input(slave, variable, signal)
-        driven.signal.at(start)
-    except ValueError as error:
-        raise ConfigurationError(f"{where}: {reference}: {error}") from None
+        driven.signal.at(float(system.simulation.start_time))
     except SlaveError as error:
-        raise ConfigurationError(f"{where}: {error.cause}") from error
+        raise ConfigurationError(f"{system.source}: [inputs]: {error.cause}") from error
     return driven
-
-
-def _constant(where: str, reference: str, variable: Variable, signal: StartValue) -> StartValue:
-    """The value of an input that is not continuous."""
-    if variable.type.is_real and type(signal) in (int, float):
-        return float(signal)
-    if type(signal) in _PYTHON_TYPES.get(variable.type, (int,)):
-        return signal
-    raise _mismatch(where, reference, variable, signal)
-
-
-_PYTHON_TYPES: Mapping[VariableType, tuple[type, ...]] = {
-    VariableType.REAL: (),
-    VariableType.FLOAT32: (),
-    VariableType.FLOAT64: (),
-    VariableType.BOOLEAN: (bool,),
-    VariableType.STRING: (str,),
-    VariableType.BINARY: (bytes,),
-    VariableType.CLOCK: (),
-}
-
-
-def _mismatch(
-    where: str, reference: str, variable: Variable, signal: StartValue
-) -> ConfigurationError:
-    return ConfigurationError(
-        f"{where}: {reference} is of type {variable.type} and cannot be {signal!r}"
-    )

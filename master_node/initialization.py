@@ -16,7 +16,6 @@ from master_node.numerics.fixed_point import NoFixedPointError, fixed_point
 from master_node.numerics.norms import first_not_finite
 from master_node.outputs import Outputs, gather, reading_calls
 from master_node.slave_group import Program, SlaveGroup
-from master_node.start_values import start_values
 from master_node.step_size_rules import step_size_limits
 from master_node.system import CoupledSystem, SlavePart
 from protocol.calls import (
@@ -91,8 +90,7 @@ def _initialize(
         start_time=float(simulation.start_time),
         stop_time=simulation.end,
         relative_tolerance=simulation.slave_relative_tolerance,
-        start_values=part.held
-        | start_values(part.description, system.slaves[part.name].parameters),
+        start_values=part.start_values,
         inputs=part.inputs,
         outputs=part.outputs,
         discrete_inputs=part.discrete_inputs,

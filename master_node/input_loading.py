@@ -5,8 +5,7 @@ Nothing is started before all of this is read and checked.
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -19,16 +18,15 @@ from master_node.configuration import InputRows, InputSettings, System
 from master_node.discrete_inputs import HoldRows
 from master_node.external_inputs import SignalFunction
 from master_node.numerics.input_tables import InputTableError, Table, make_table
+from master_node.text_tables import SUFFIXES, TextTable, is_number, read_text_table
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
 from protocol.signals import FloatArray
 from protocol.slave import StartValue
 from protocol.user_code import load_module, user_context
 
-Columns = Mapping[str, NDArray[Any]]
-"""The columns of a file by name, in its order; texts out of a CSV file."""
-
-_READ = {".csv", ".npy", ".npz"}
+_READ = {*SUFFIXES, ".npy", ".npz"}
+_TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0}
 
 
 def load_signals(system: System) -> dict[str, StartValue | Table | HoldRows | SignalFunction]:
@@ -40,7 +38,7 @@ def load_signals(system: System) -> dict[str, StartValue | Table | HoldRows | Si
     Raises:
         ConfigurationError: with the system's source and the input.
     """
-    files: dict[Path, Columns] = {}
+    files: dict[Path, TextTable] = {}
     signals: dict[str, StartValue | Table | HoldRows | SignalFunction] = {}
     for name, setting in system.inputs.items():
         try:
@@ -62,13 +60,13 @@ def load_signals(system: System) -> dict[str, StartValue | Table | HoldRows | Si
 
 
 def _table(
-    setting: InputSettings, table: str | InputRows, system: System, files: dict[Path, Columns]
+    setting: InputSettings, table: str | InputRows, system: System, files: dict[Path, TextTable]
 ) -> Table | HoldRows:
     if isinstance(table, InputRows):
-        times, values, place, name = table.times, table.values, "", "value"
+        times, values, place, name, unit = table.times, table.values, "", "value", ""
     else:
         place = f"{Path(table).name}: "
-        times, values, name = _rows(setting, system.base / table, files)
+        times, values, name, unit = _rows(setting, system.base / table, files)
     holds = setting.interpolation == "hold"
     numbers = None if holds and not _are_numbers(values) else _numbers(place, name, values)
     span = (float(system.simulation.start_time), system.simulation.end)
@@ -78,13 +76,14 @@ def _table(
         setting.interpolation,
         span,
         extrapolates=setting.extrapolate is not None,
+        unit=unit,
     )
-    return HoldRows(times, values, None if numbers is None else made) if holds else made
+    return HoldRows(times, values, None if numbers is None else made, unit) if holds else made
 
 
 def _are_numbers(column: NDArray[Any]) -> bool:
     if column.dtype.kind == "U":
-        return all(map(_is_number, column.tolist()))
+        return all(map(is_number, column.tolist()))
     return column.dtype.kind != "b"
 
 
@@ -99,7 +98,7 @@ def _numbers(place: str, name: str, column: NDArray[Any]) -> FloatArray:
         raise ConfigurationError(f"{place}{name} is no column of numbers", remedy=remedy)
     if column.dtype.kind == "U":
         for row, text in enumerate(column.tolist(), 1):
-            if not _is_number(text):
+            if not is_number(text):
                 raise ConfigurationError(
                     f"{place}row {row}: {name} = {text!r} is not a number", remedy=remedy
                 )
@@ -107,12 +106,12 @@ def _numbers(place: str, name: str, column: NDArray[Any]) -> FloatArray:
 
 
 def _rows(
-    setting: InputSettings, path: Path, files: dict[Path, Columns]
-) -> tuple[FloatArray, NDArray[Any], str]:
-    """Times, values, and the name of their column."""
+    setting: InputSettings, path: Path, files: dict[Path, TextTable]
+) -> tuple[FloatArray, NDArray[Any], str, str]:
+    """Times, values, the name of their column, and their unit."""
     if path not in files:
         files[path] = _read(path)
-    columns = files[path]
+    columns, units = files[path]
     names = list(columns)
     time = setting.time if setting.time is not None else names[0]
     others = [name for name in names if name != time]
@@ -133,60 +132,39 @@ def _rows(
         raise ConfigurationError(
             f"{path.name}: {len(times)} times in {time!r} and {len(values)} values in {column!r}"
         )
-    return _numbers(f"{path.name}: ", time, times), values, column
+    seconds = _TIME_UNITS.get(units[time])
+    if seconds is None:
+        raise ConfigurationError(
+            f"{path.name}: the times {time!r} have the unit {units[time]!r}",
+            remedy="give them in s, ms, us, min or h",
+        )
+    numbers = _numbers(f"{path.name}: ", time, times)
+    return numbers if seconds == 1.0 else numbers * seconds, values, column, units[column]
 
 
-def _read(path: Path) -> Columns:
+def _read(path: Path) -> TextTable:
     """A file as columns.
 
     Raises:
         ConfigurationError: it is missing, or not what its suffix says.
     """
-    if path.suffix not in _READ:
+    suffix = path.suffix.lower()
+    if suffix not in _READ:
         raise ConfigurationError(f"{path.name}: a table is a file {', '.join(sorted(_READ))}")
     if not path.is_file():
         beside = sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))
         raise ConfigurationError(f"no file {path}{nearest(path.name, beside)}")
     try:
-        return _read_csv(path) if path.suffix == ".csv" else _read_numpy(path)
+        return read_text_table(path) if suffix in SUFFIXES else _read_numpy(path)
     except OSError as error:
         raise ConfigurationError(f"{path.name}: cannot be read: {error.strerror}") from error
 
 
-def _read_csv(path: Path) -> Columns:
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        try:
-            lines = [line for line in csv.reader(file, strict=True) if line]
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise ConfigurationError(f"{path.name}: not a CSV file: {error}") from error
-    if not lines:
-        raise ConfigurationError(f"{path.name}: is empty")
-    names = [name.strip() for name in lines[0]]
-    if all(_is_number(name) for name in names):
-        raise ConfigurationError(f"{path.name}: the first line must name the columns")
-    if len(set(names)) < len(names):
-        raise ConfigurationError(f"{path.name}: two columns of one name in {', '.join(names)}")
-    for number, line in enumerate(lines[1:], 1):
-        if len(line) != len(names):
-            raise ConfigurationError(
-                f"{path.name}: row {number} has {len(line)} values for {len(names)} columns"
-            )
-    texts = np.array(lines[1:], dtype=np.str_).reshape(-1, len(names))
-    return dict(zip(names, texts.T, strict=True))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _read_numpy(path: Path) -> Columns:
+def _read_numpy(path: Path) -> TextTable:
     try:
         loaded = np.load(path, allow_pickle=False)
-        arrays = {name: loaded[name] for name in loaded.files} if path.suffix == ".npz" else loaded
+        is_zip = path.suffix.lower() == ".npz"
+        arrays = {name: loaded[name] for name in loaded.files} if is_zip else loaded
     except (ValueError, EOFError, AttributeError, BadZipFile, MemoryError) as error:
         raise ConfigurationError(
             f"{path.name}: not a NumPy file of numbers, truth values or texts"
@@ -209,7 +187,7 @@ def _read_numpy(path: Path) -> Columns:
             )
     if not arrays:
         raise ConfigurationError(f"{path.name}: is empty")
-    return dict(arrays)
+    return TextTable(dict(arrays), dict.fromkeys(arrays, ""))
 
 
 # ---- Functions ----------------------------------------------------------------------------------

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from protocol.errors import ConfigurationError
-from protocol.slave import Causality, SlaveDescription, StartValue, Variable, VariableType
+from protocol.slave import Causality, SlaveDescription, StartValue, Variable
+from protocol.values import BoundsError, checked_value
+
+IGNORE_BOUNDS = "correct the value, or say ignore_bounds = true in the table of the slave"
 
 GivenValue = StartValue | Sequence["GivenValue"]
 """A value, or for an array its rows."""
+
+Place = Callable[[str], str]
+"""Where the value of a variable is given, for messages."""
 
 
 def structural_parameters(description: SlaveDescription) -> frozenset[str]:
@@ -16,18 +22,39 @@ def structural_parameters(description: SlaveDescription) -> frozenset[str]:
     return frozenset(v.name for v in description.of(Causality.STRUCTURAL_PARAMETER))
 
 
+def structural_values(
+    description: SlaveDescription,
+    given: Mapping[str, GivenValue],
+    place: Place = repr,
+    *,
+    ignores_bounds: bool = False,
+) -> dict[str, StartValue]:
+    """The values of structural parameters; arguments and errors as for `start_values`."""
+    variables = {v.name: v for v in description.of(Causality.STRUCTURAL_PARAMETER)}
+    return {
+        name: _checked(place(name), variables[name], value, ignores_bounds)
+        for name, value in given.items()
+        if name in variables and not isinstance(value, tuple)
+    }
+
+
 def start_values(
-    description: SlaveDescription, given: Mapping[str, GivenValue]
+    description: SlaveDescription,
+    given: Mapping[str, GivenValue],
+    place: Place = repr,
+    *,
+    ignores_bounds: bool = False,
 ) -> dict[str, StartValue]:
     """Start values by the names of single variables, but for those of structural parameters.
 
     Args:
         description: of the slave.
-        given: by variable name; a list of values, or of rows, for an array; a text of hexadecimal
-            digits for a binary variable.
+        given: by variable name, see `value_of`; a list of values, or of rows, for an array.
+        place: where the value of a variable is given, for messages.
+        ignores_bounds: take values beyond ``min`` and ``max``, and numbers that no item has.
 
     Raises:
-        ConfigurationError: an array has no such element, or a text is not hexadecimal.
+        ConfigurationError: an array has no such element, or a value is none of the variable.
     """
     variables = {variable.name: variable for variable in description.variables}
     values: dict[str, StartValue] = {}
@@ -36,11 +63,19 @@ def start_values(
         if name in structural:
             continue
         for element, number in _elements(name, value):
-            variable = variables.get(element)
-            if variable is None:
-                raise ConfigurationError(f"parameters: there is no variable {element!r}")
-            values[element] = _value(variable, number)
+            where = place(name) if element == name else f"{place(name)}: {element!r}"
+            if element not in variables:
+                raise ConfigurationError(f"{place(name)}: there is no variable {element!r}")
+            values[element] = _checked(where, variables[element], number, ignores_bounds)
     return values
+
+
+def _checked(where: str, variable: Variable, value: GivenValue, ignores_bounds: bool) -> StartValue:
+    try:
+        return checked_value(variable, value, ignores_bounds=ignores_bounds)
+    except ValueError as error:
+        remedy = IGNORE_BOUNDS if isinstance(error, BoundsError) else ""
+        raise ConfigurationError(f"{where} {error}", remedy=remedy) from None
 
 
 def _elements(name: str, value: GivenValue) -> Iterator[tuple[str, StartValue]]:
@@ -57,14 +92,3 @@ def _elements(name: str, value: GivenValue) -> Iterator[tuple[str, StartValue]]:
             comma = "," if indices else ""
             rows = [(f"{indices}{comma}{i}", row) for i, row in enumerate(part, start=1)]
             stack += reversed(rows)
-
-
-def _value(variable: Variable, value: StartValue) -> StartValue:
-    if variable.type is VariableType.BINARY and isinstance(value, str):
-        try:
-            return bytes.fromhex(value)
-        except ValueError:
-            raise ConfigurationError(
-                f"parameters: {variable.name} is binary, and {value!r:.40} is no hexadecimal text"
-            ) from None
-    return value

@@ -16,7 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from master_node.configuration import System
-from master_node.connections import ScalarConnection, VariableFinder, resolve_connections
+from master_node.connections import (
+    ScalarConnection,
+    VariableFinder,
+    read_variables,
+    resolve_connections,
+)
 from master_node.discrete_coupling import DiscreteCoupling, couple_discrete
 from master_node.external_inputs import ExternalInputs, Jump
 from master_node.external_resolution import (
@@ -27,6 +32,7 @@ from master_node.external_resolution import (
 )
 from master_node.input_loading import load_signals
 from master_node.recorded_variables import RecordedVariables, wanted_variables
+from master_node.start_values import start_values
 from master_node.tolerances import tolerance
 from protocol.errors import ConfigurationError
 from protocol.names import nearest
@@ -44,10 +50,11 @@ class SlavePart:
     Attributes:
         inputs: names of its continuous inputs that are driven: first the connected ones, then the
             external ones; these are the columns of what it is given.
-        outputs: names of its continuous real outputs.
+        outputs: names of its continuous real outputs, and of such variables that feed inputs.
         discrete_inputs, discrete_outputs: names of its other inputs, first the connected ones, then
-            those that change from outside, and of its other outputs.
-        held: constants for its other external inputs, by name.
+            inputs and tunable parameters that change from outside, and of its other outputs.
+        locals: those among its outputs that are none to the model, and feed inputs all the same.
+        start_values: of its variables, with constants for its other external inputs, by name.
         input_slice, output_slice: where its connected inputs and its outputs are in u and y.
         external_slice: where its external inputs are among those of the system.
         external_rows: how many rows of derivatives these need at most.
@@ -60,7 +67,8 @@ class SlavePart:
     outputs: tuple[str, ...]
     discrete_inputs: tuple[str, ...]
     discrete_outputs: tuple[str, ...]
-    held: dict[str, StartValue]
+    locals: tuple[str, ...]
+    start_values: dict[str, StartValue]
     input_slice: slice
     output_slice: slice
     external_slice: slice
@@ -77,6 +85,11 @@ class SlavePart:
     def external(self) -> tuple[str, ...]:
         """Names of its external inputs."""
         return self.inputs[len(self.connected) :]
+
+    @property
+    def max_output_derivative_order(self) -> int:
+        """Of all its outputs: only what a model declares as an output has derivatives in FMI."""
+        return 0 if self.locals else self.description.capabilities.max_output_derivative_order
 
     @property
     def max_order(self) -> int:
@@ -223,10 +236,11 @@ def resolve(
     """
     finder = VariableFinder(descriptions)
     connections = resolve_connections(system, finder)
-    _check_slave_tables(system, finder)
+    read = read_variables(descriptions, connections)
+    _check_slave_tables(system, finder, read)
     outputs = {
-        name: tuple(v for v in description.of(Causality.OUTPUT) if v.is_continuous_real)
-        for name, description in descriptions.items()
+        name: tuple(v for v in variables if v.is_continuous_real)
+        for name, variables in read.items()
     }
     everything = [(slave, variable) for slave in outputs for variable in outputs[slave]]
     output_index = {(slave, variable.name): i for i, (slave, variable) in enumerate(everything)}
@@ -244,14 +258,20 @@ def resolve(
     external = resolve_external(
         system, finder, connections, load_signals(system) if signals is None else signals
     )
-    parts = _parts(descriptions, feeding, outputs, external)
+    parts = _parts(system, descriptions, feeding, read, external)
     feeds = [feeding[part.name][variable] for part in parts for variable in part.connected]
     tolerances = [tolerance(system, slave, v) for slave, v in everything]
-    initial = {part.name: part.description.initial_feed_through for part in parts}
-    direct = {part.name: part.description.feed_through for part in parts}
+    initial, direct = (
+        {
+            (slave, variable.name): descriptions[slave].direct_inputs(variable, initially=initially)
+            for slave, variables in read.items()
+            for variable in variables
+        }
+        for initially in (True, False)
+    )
     slave_index = {name: i for i, name in enumerate(descriptions)}
     discrete = couple_discrete(
-        descriptions,
+        read,
         [
             [
                 feeding[part.name][name]
@@ -283,7 +303,7 @@ def resolve(
         output_names=tuple(f"{slave}.{v.name}" for slave, v in everything),
         output_units=tuple(v.unit for _, v in everything),
         output_slave=np.array([slave_index[slave] for slave, _ in everything], dtype=np.intp),
-        feed_through=_depends(parts, {part.name: part.connected for part in parts}),
+        feed_through=_depends(parts, direct, {part.name: part.connected for part in parts}),
         absolute_tolerance=np.array([absolute for absolute, _ in tolerances]),
         relative_tolerance=np.array([relative for _, relative in tolerances]),
         is_controlled=is_controlled,
@@ -294,6 +314,7 @@ def resolve(
         external=ExternalInputs([one for each in external.values() for one in each.continuous]),
         held_feed_through=_depends(
             parts,
+            direct,
             {
                 name: [
                     one.variable
@@ -306,12 +327,16 @@ def resolve(
     )
 
 
-def _depends(parts: Sequence[SlavePart], inputs: Mapping[str, Sequence[str]]) -> NDArray[np.bool_]:
+def _depends(
+    parts: Sequence[SlavePart],
+    direct: Mapping[_Key, tuple[str, ...]],
+    inputs: Mapping[str, Sequence[str]],
+) -> NDArray[np.bool_]:
     """Whether each output depends directly on one of these inputs of its slave, shape (m,)."""
     names = [frozenset(inputs[part.name]) for part in parts]
     return np.array(
         [
-            not own.isdisjoint(part.description.feed_through.get(output, ()))
+            not own.isdisjoint(direct[part.name, output])
             for part, own in zip(parts, names, strict=True)
             for output in part.outputs
         ],
@@ -320,14 +345,17 @@ def _depends(parts: Sequence[SlavePart], inputs: Mapping[str, Sequence[str]]) ->
 
 
 def _parts(
+    system: System,
     descriptions: Mapping[str, SlaveDescription],
     feeding: Mapping[str, Mapping[str, ScalarConnection]],
-    outputs: Mapping[str, tuple[Variable, ...]],
+    read: Mapping[str, tuple[Variable, ...]],
     external: Mapping[str, SlaveExternals],
 ) -> tuple[SlavePart, ...]:
     parts = []
     n = m = n_e = 0
     for name, description in descriptions.items():
+        settings = system.slaves[name]
+        outputs = [v for v in read[name] if v.is_continuous_real]
         connected = [v for v in description.of(Causality.INPUT) if v.name in feeding[name]]
         inputs = [v for v in connected if feeding[name][v.name].is_continuous]
         parts.append(
@@ -337,17 +365,22 @@ def _parts(
                     *(v.name for v in inputs),
                     *(one.variable for one in external[name].continuous),
                 ),
-                outputs=tuple(v.name for v in outputs[name]),
+                outputs=tuple(v.name for v in outputs),
                 discrete_inputs=(
                     *(v.name for v in connected if not feeding[name][v.name].is_continuous),
                     *(one.variable for one in external[name].driven),
                 ),
-                discrete_outputs=tuple(
-                    v.name for v in description.of(Causality.OUTPUT) if v.is_discrete
+                discrete_outputs=tuple(v.name for v in read[name] if v.is_discrete),
+                locals=tuple(v.name for v in read[name] if v.causality is not Causality.OUTPUT),
+                start_values=external[name].held
+                | start_values(
+                    description,
+                    settings.parameters,
+                    partial(system.places.parameter, name),
+                    ignores_bounds=settings.ignore_bounds,
                 ),
-                held=external[name].held,
                 input_slice=slice(n, n + len(inputs)),
-                output_slice=slice(m, m + len(outputs[name])),
+                output_slice=slice(m, m + len(outputs)),
                 external_slice=slice(n_e, n_e + len(external[name].continuous)),
                 external_rows=max((1 + one.degree for one in external[name].continuous), default=0),
                 input_starts=np.array([float(v.start or 0.0) for v in inputs]),
@@ -355,14 +388,16 @@ def _parts(
             )
         )
         n += len(inputs)
-        m += len(outputs[name])
+        m += len(outputs)
         n_e += len(external[name].continuous)
     return tuple(parts)
 
 
-def _check_slave_tables(system: System, finder: VariableFinder) -> None:
+def _check_slave_tables(
+    system: System, finder: VariableFinder, read: Mapping[str, tuple[Variable, ...]]
+) -> None:
     for slave, settings in system.slaves.items():
-        outputs = [v.name for v in finder.descriptions[slave].of(Causality.OUTPUT)]
+        outputs = [v.name for v in read[slave]]
         tables: list[tuple[Callable[[str, str], str], Mapping[str, object], Sequence[str]]] = [
             (system.places.parameter, settings.parameters, finder.names(slave)),
             (system.places.tolerance, settings.tolerances, outputs),
@@ -390,13 +425,13 @@ def _check_slave_tables(system: System, finder: VariableFinder) -> None:
 def _feed_through_order(
     output_index: Mapping[_Key, int],
     discrete: DiscreteCoupling,
-    feed_through: Mapping[str, Mapping[str, tuple[str, ...]]],
+    feed_through: Mapping[_Key, tuple[str, ...]],
     feeding: Mapping[str, Mapping[str, ScalarConnection]],
 ) -> FeedThroughOrder:
     depends = {
         (slave, output): [
             feeding[slave][name].source.key
-            for name in feed_through[slave].get(output, ())
+            for name in feed_through[slave, output]
             if name in feeding[slave]
         ]
         for slave, output in (*output_index, *discrete.keys)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import shutil
@@ -22,11 +23,12 @@ from master_node.configuration import System, load_system
 from master_node.places import SspPlaces
 from master_node.ssp.flattening import FlatConnection, Slave, flatten
 from master_node.ssp.reading import read_structure
-from master_node.ssp.structure import Notes, Structure, listed
+from master_node.ssp.structure import Notes, Structure
 from master_node.ssp.writing import write_package
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.files import as_file, is_fmu
 from protocol.keys import check_name
+from protocol.names import listed
 from protocol.new_files import open_new, own_folder
 from protocol.scratch import ScratchDirectory
 from protocol.slave import SlaveDescription
@@ -315,11 +317,15 @@ def _toml(tables: dict[str, Any]) -> str:
 
 
 def _connection(table: dict[str, Any]) -> str:
-    """With an inline table for its mapping, whose keys are booleans or numbers."""
+    """With an inline table for its mapping, whose keys need not be texts."""
     mapping = table.pop("mapping", {})
     text = f"[[connections]]\n{tomli_w.dumps(table)}"
-    entries = ", ".join(f"{key} = {str(value).lower()}" for key, value in mapping.items())
+    entries = ", ".join(f"{_entry(key)} = {_entry(value)}" for key, value in mapping.items())
     return f"{text}mapping = {{ {entries} }}\n" if mapping else text
+
+
+def _entry(value: bool | int | str) -> str:
+    return json.dumps(value) if isinstance(value, str) else str(value).lower()
 
 
 def _replace(output: Path, write: Callable[[Path], object]) -> None:

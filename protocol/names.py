@@ -6,6 +6,13 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 
+def listed(names: Iterable[str]) -> str:
+    """Names for a message, all of up to ten."""
+    quoted = list(map(repr, names))
+    more = f" and {len(quoted) - 10} more" if len(quoted) > 10 else ""
+    return ", ".join(quoted[:10]) + more
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """``; did you mean 'x'?`` for an error message, or what there is, or an empty string."""
     names = list(known)

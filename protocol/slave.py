@@ -157,6 +157,11 @@ class Variable:
     items: Mapping[str, int] = field(default_factory=dict, hash=False)
 
     @property
+    def has_bounds(self) -> bool:
+        """Whether values are declared that it must not have."""
+        return bool(self.items) or self.minimum is not None or self.maximum is not None
+
+    @property
     def is_continuous_real(self) -> bool:
         """True for what takes part in extrapolation and in the error norm."""
         return self.type.is_real and self.variability == "continuous"
@@ -196,7 +201,8 @@ class SlaveDescription:
         sha256: of the FMU file or of the Python source, hexadecimal.
         variables: all of them, in the order of the model description.
         feed_through: for each output the inputs on which it depends directly, at a
-            communication point (ModelStructure/Outputs); outputs not named depend on none.
+            communication point (ModelStructure/Outputs); outputs not named depend on none. Also
+            for local variables of which that is known, see `direct_inputs`.
         initial_feed_through: the same in initialization mode (ModelStructure/InitialUnknowns).
         state_kind: how its state is saved.
         state_reason: why it is not saved natively; "" if it is.
@@ -232,6 +238,19 @@ class SlaveDescription:
             if variable.name == name:
                 return variable
         raise KeyError(name)
+
+    def direct_inputs(self, variable: Variable, *, initially: bool = False) -> tuple[str, ...]:
+        """The inputs on which a variable depends directly.
+
+        Args:
+            variable: an output, or another one; what is not known of a local variable counts as
+                depending on all inputs.
+            initially: in initialization mode.
+        """
+        depends = self.initial_feed_through if initially else self.feed_through
+        if variable.name not in depends and variable.causality is Causality.LOCAL:
+            return tuple(v.name for v in self.of(Causality.INPUT))
+        return depends.get(variable.name, ())
 
     def of(self, causality: Causality) -> tuple[Variable, ...]:
         """The variables of one causality, in order."""

@@ -30,12 +30,11 @@ from protocol.keys import AgentKey, RouterKey, SlaveKey, check_name
 from protocol.logs import LogFormat, about, configure_logs, logs_json
 from protocol.processes import ending_signals
 from protocol.scratch import ScratchDirectory
-from protocol.slave import StartValue
 from protocol.standard_error import forgive_standard_error
 from protocol.standard_output import guarded_standard_output, output_of_others
 from protocol.terminal import say, say_error, say_json
 from protocol.threads import start_thread
-from protocol.toml_text import toml_value
+from protocol.toml_text import assigned_values
 
 if TYPE_CHECKING:
     from slave_node.worker import Worker
@@ -96,6 +95,10 @@ def serve(  # noqa: PLR0917  options of the command line
     parameter: Annotated[
         list[str] | None, typer.Option(help="Start value, name=value; may be repeated.")
     ] = None,
+    ignore_bounds: Annotated[
+        bool,
+        typer.Option("--ignore-bounds", help="Take start values beyond the model's min and max."),
+    ] = False,
     insecure: Insecure = False,
     tls: Tls = None,
     mode: BusModeOption = BusMode.PEER,
@@ -128,6 +131,7 @@ def serve(  # noqa: PLR0917  options of the command line
 ) -> None:
     """Load MODEL and serve it until SIGTERM or Ctrl-C."""
     from protocol.zenoh_bus import ZenohBus  # noqa: PLC0415  keeps the worker light
+    from slave_node.given_parameters import check_parameters  # noqa: PLC0415
     from slave_node.node import SlaveNode  # noqa: PLC0415
     from slave_node.worker import ModelReference, WorkerProcess  # noqa: PLC0415
 
@@ -144,7 +148,7 @@ def serve(  # noqa: PLR0917  options of the command line
         model,
         base.absolute(),
         key.name,
-        _parameters(parameter or []),
+        assigned_values("--parameter", parameter or ()),
         fmi_logging,
         state,
         log_format,
@@ -176,6 +180,7 @@ def serve(  # noqa: PLR0917  options of the command line
         _end_with_parent(end)
     try:
         description = worker.start()
+        check_parameters(description, reference.parameters, ignores_bounds=ignore_bounds)
         for remark in description.remarks:
             log.warning("%s", remark)
         bus = ZenohBus(endpoints, stop=ending)
@@ -471,20 +476,6 @@ def _default_name(model: str, base: Path) -> str:
         return model.rpartition(":")[2]
     path = (base / model).resolve()
     return path.name if path.is_dir() else path.stem
-
-
-def _parameters(assignments: list[str]) -> dict[str, StartValue]:
-    """``name=value`` with the value in TOML's notation; what is none is a string."""
-    values: dict[str, StartValue] = {}
-    for assignment in assignments:
-        name, equals, text = assignment.partition("=")
-        if not equals or not name:
-            raise ConfigurationError(f"--parameter {assignment}: write name=value")
-        value = toml_value(text)
-        if not isinstance(value, float | int | bool | str):
-            raise ConfigurationError(f"--parameter {assignment}: not a number, boolean or string")
-        values[name.strip()] = value
-    return values
 
 
 def _finite(value: Any) -> Any:

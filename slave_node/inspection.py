@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from rich.box import SIMPLE_HEAD
 from rich.table import Column, Table
 
-from protocol.slave import SlaveDescription
+from protocol.slave import SlaveDescription, Variable
 from protocol.tables import plain
+from protocol.values import item_name
 from slave_node.validation import Finding, Grade
 
 _STATE = {
@@ -90,6 +91,9 @@ def _variables(description: SlaveDescription) -> Table:
         table.add_column(column, no_wrap=True)
     table.add_column("start", no_wrap=True, justify="right")
     table.add_column("nominal", no_wrap=True, justify="right")
+    has_bounds = any(v.has_bounds for v in description.variables)
+    if has_bounds:
+        table.add_column("values", overflow="fold", min_width=8)
     table.add_column("description", min_width=12)
     for v in description.variables:
         cells = (
@@ -98,12 +102,31 @@ def _variables(description: SlaveDescription) -> Table:
             v.variability,
             v.type.value,
             v.unit,
-            "" if v.start is None else str(v.start),
+            _start(v),
             "" if v.nominal == 1.0 else str(v.nominal),
+            *((_values(v),) if has_bounds else ()),
             v.description,
         )
         table.add_row(*map(plain, cells))
     return table
+
+
+def _start(variable: Variable) -> str:
+    if variable.start is None:
+        return ""
+    return item_name(variable, variable.start) or str(variable.start)
+
+
+def _values(variable: Variable) -> str:
+    """What the model allows: the items of an enumeration with their numbers, or min and max."""
+    if variable.items:
+        return ", ".join(f"{name} = {number}" for name, number in variable.items.items())
+    smallest, largest = variable.minimum, variable.maximum
+    if smallest is not None and largest is not None:
+        return f"{smallest} to {largest}"
+    if smallest is not None:
+        return f"from {smallest}"
+    return "" if largest is None else f"up to {largest}"
 
 
 def _yes(value: bool) -> str:

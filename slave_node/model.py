@@ -147,6 +147,7 @@ def describe(model: type[Model]) -> SlaveDescription:
         ),
         *(replace(v, causality=Causality.PARAMETER, variability="fixed") for v in model.parameters),
     )
+    local_states = [state.name for state in model.states if state.name not in output_names]
     has_output_derivatives = _overrides(model, "output_derivatives") or (
         output_names <= state_names and not _overrides(model, "output_values")
     )
@@ -163,8 +164,8 @@ def describe(model: type[Model]) -> SlaveDescription:
             can_handle_variable_step_size=True,
             outputs_follow_inputs=True,
         ),
-        feed_through=dict(model.feed_through),
-        initial_feed_through=dict(model.feed_through),
+        feed_through={**dict.fromkeys(local_states, ()), **model.feed_through},
+        initial_feed_through={**dict.fromkeys(local_states, ()), **model.feed_through},
         state_kind=StateKind.NATIVE,
         input_derivatives=InputDerivatives.NATIVE,
     )

@@ -36,10 +36,10 @@ from protocol.slave import (
     StartValue,
     StepStatus,
     Variable,
-    VariableType,
     refuse_discrete,
 )
 from protocol.user_code import error_text, user_context
+from protocol.values import value_of
 from slave_node.model import Model, describe, real
 
 __all__ = ["Model", "ModelSlave", "ModelState", "real"]
@@ -102,6 +102,9 @@ class ModelSlave(Slave):
         self._input_names = [v.name for v in model.inputs]
         self._output_names = [v.name for v in model.outputs]
         self._state_names = [v.name for v in model.states]
+        local = [i for i, name in enumerate(self._state_names) if name not in self._output_names]
+        self._local_states = np.array(local, dtype=np.intp)
+        self._readable_names = [*self._output_names, *(self._state_names[i] for i in local)]
         self._nominal = np.array([v.nominal for v in model.states])
         self._recorded: tuple[str, ...] = ()
         self.reset()
@@ -176,7 +179,7 @@ class ModelSlave(Slave):
         self._tolerance = tolerance
         self._input_columns = self._columns("input", inputs, self._input_names)
         self._held_columns = list[int]()
-        self._output_columns = self._columns("output", outputs, self._output_names)
+        self._output_columns = self._columns("output", outputs, self._readable_names)
         try:
             self._model = self._run(self._model_class)
         except Exception as error:
@@ -359,6 +362,8 @@ class ModelSlave(Slave):
     def get_outputs(self, order: int) -> FloatArray:
         """See `Slave`: shape (order + 1, n_y), [y]/s^j, with the inputs at the communication point.
 
+        States that are no outputs may be read with them.
+
         Raises:
             SlaveError: ``order`` is beyond ``max_output_derivative_order``, or the model is wrong.
         """
@@ -370,11 +375,13 @@ class ModelSlave(Slave):
         t, x, u = self._state.time, self._state.x, self._state.inputs.derivatives
         n = len(self._output_names)
         with np.errstate(all="ignore"):
-            rows = [self._evaluate("output_values", n, t, x, u[0])]
+            y = self._evaluate("output_values", n, t, x, u[0])
+            rows = [np.concatenate([y, x[self._local_states]])]
             if order == 1:
                 dx = self._evaluate("derivatives", len(x), t, x, u[0]) if len(x) else x
                 du = u[1] if len(u) > 1 else np.zeros_like(u[0])
-                rows.append(self._evaluate("output_derivatives", n, t, x, u[0], dx, du))
+                dy = self._evaluate("output_derivatives", n, t, x, u[0], dx, du)
+                rows.append(np.concatenate([dy, dx[self._local_states]]))
         return np.array(rows)[:, self._output_columns]
 
     def _evaluate(self, method: str, size: int, t: float, *args: FloatArray) -> FloatArray:
@@ -518,15 +525,7 @@ def _converted(variable: Variable, value: StartValue) -> StartValue:
     Raises:
         ConfigurationError: it has another type.
     """
-    accepted: Mapping[VariableType, tuple[type, ...]] = {
-        VariableType.REAL: (float, int),
-        VariableType.BOOLEAN: (bool,),
-        VariableType.STRING: (str,),
-    }
-    is_boolean = variable.type is VariableType.BOOLEAN
-    right = isinstance(value, accepted.get(variable.type, (int,)))
-    if not right or isinstance(value, bool) != is_boolean:
-        raise ConfigurationError(
-            f"'{variable.name}' is {variable.type} and cannot start with {value!r}"
-        )
-    return float(value) if variable.type is VariableType.REAL else value
+    try:
+        return value_of(variable, value)
+    except ValueError as error:
+        raise ConfigurationError(f"{variable.name!r} {error}") from None

@@ -11,6 +11,7 @@ import pytest
 
 from master_node import Result, System, load_system, simulate
 from protocol.errors import ConfigurationError, SlaveError
+from slave_node.fmu.description import describe_fmu
 from tests.conftest import EXAMPLES
 
 
@@ -258,11 +259,28 @@ def test_a_mapping_opens_a_way_between_types(capability_dir: Path) -> None:
     assert "add the value to the mapping" in str(caught.value)
 
 
+def test_items_are_mapped_by_name(capability_dir: Path) -> None:
+    """Names of items say what their numbers say; a wrong one is told with the items."""
+    ends = ("clock.counter_out", "device.enumeration_in")
+    description = describe_fmu(capability_dir / "all_types2.fmu")
+    items = description.variable("enumeration_in").items
+    names = {number: name for name, number in items.items()}
+    numbers = {0: 3, 1: 2, 2: 1, 3: 2, 4: 3}
+    named = {str(count): names[number] for count, number in numbers.items()}
+    both = [
+        simulate(mapped(capability_dir, *ends, each), in_process=True) for each in (numbers, named)
+    ]
+    assert np.array_equal(*(one["device.enumeration_out"] for one in both))
+    with pytest.raises(ConfigurationError, match=f"has no item 'x'; there is '{names[1]}'"):
+        simulate(mapped(capability_dir, *ends, {1: "x"}), in_process=True)
+
+
 @pytest.mark.parametrize(
     ("target", "mapping", "more", "told"),
     [
         ("integer_in", {0: True}, {}, "write { false = true, … } or { 1 = 2, … }"),
-        ("integer_in", {"x": 1}, {}, "write { false = true, … } or { 1 = 2, … }"),
+        ("integer_in", {"x": 1}, {}, "and has no item 'x'"),
+        ("integer_in", {"true": "x"}, {}, "write { false = true, … } or { 1 = 2, … }"),
         ("integer_in", {}, {}, "write { false = true, … } or { 1 = 2, … }"),
         ("integer_in", {"1": 1, "01": 2}, {}, "01 is there twice"),
         ("integer_in", {1: 1}, {"factor": 2.0}, "cannot stand beside factor"),

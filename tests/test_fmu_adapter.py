@@ -125,11 +125,13 @@ def test_the_description_says_what_the_file_says(fmu_dir: Path) -> None:
     assert can.can_interpolate_inputs
     assert can.can_handle_variable_step_size
     assert can.max_output_derivative_order == 1
-    assert description.feed_through == {"F": ("x_c", "v_c")}
+    states = {"x": (), "v": (), "der(x)": (), "der(v)": ("x_c", "v_c")}
+    assert description.feed_through == {"F": ("x_c", "v_c")} | states
     assert description.initial_feed_through == {"F": ("x_c", "v_c")}
     assert description.state_kind == "native"
     assert len(description.sha256) == 64
-    assert describe_fmu(fmu_dir / "wheel.fmu").feed_through == {}
+    wheel = describe_fmu(fmu_dir / "wheel.fmu").feed_through
+    assert wheel == {"der(x)": (), "der(v)": ("x_c", "v_c")}
 
 
 def test_the_slave_has_the_description_of_its_file(load: Load, fmu_dir: Path) -> None:

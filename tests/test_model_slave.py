@@ -577,8 +577,8 @@ def test_reset_forgets_everything():
     [
         ({"start_values": {"angel": 1.0}}, "no variable 'angel'; did you mean 'angle'"),
         ({"start_values": {"power": 1.0}}, "'power' is computed by Pendulum"),
-        ({"start_values": {"angle": "1"}}, "'angle' is Real and cannot start with '1'"),
-        ({"start_values": {"angle": True}}, "cannot start with True"),
+        ({"start_values": {"angle": "1"}}, "'angle' is of type Real; it cannot be '1'"),
+        ({"start_values": {"angle": True}}, "it cannot be True"),
         ({"inputs": ["torqe"]}, "no input 'torqe'; did you mean 'torque'"),
         ({"outputs": ["zzz"]}, "no output 'zzz'; there is 'angle', 'speed', 'power'"),
         ({"outputs": ["angle", "angle"]}, "'angle' is listed twice"),

@@ -415,6 +415,15 @@ def test_inspect_shows_what_a_user_asks_first(fmu_dir: Path) -> None:
         assert words in text
 
 
+def test_inspect_shows_which_values_a_variable_can_have(capability_dir: Path) -> None:
+    """Bounds, and the items of enumerations with their numbers; starts by the names of items."""
+    lines = inspect(str(capability_dir / "drive2.fmu")).splitlines()
+    gain, mode = (next(line for line in lines if line.split()[:1] == [n]) for n in ("gain", "mode"))
+    assert "0.0 to 10.0" in gain
+    assert "forward" in mode
+    assert "reverse = -1" in mode
+
+
 def strict(text: str) -> Any:
     """JSON as the standard has it, without NaN and Infinity."""
 

@@ -36,7 +36,7 @@ def test_texts_are_bytes_only_for_binary_variables() -> None:
     """Hexadecimal digits; a string stays one."""
     values = start_values(DESCRIPTION, {"data": "00ff", "name": "00ff"})
     assert values == {"data": b"\x00\xff", "name": "00ff"}
-    with pytest.raises(ConfigurationError, match="data is binary, and 'no'"):
+    with pytest.raises(ConfigurationError, match="'data' is of type Binary; it cannot be 'no'"):
         start_values(DESCRIPTION, {"data": "no"})
 
 

@@ -150,6 +150,31 @@ def test_a_sample_varies_the_ranges_and_keeps_the_rest() -> None:
     assert cases(text) == found
 
 
+@pytest.mark.parametrize(
+    ("row", "values"),
+    [
+        ("from = 1, to = 3, number = 3", [1, 2, 3]),
+        ("from = 10, to = -10, number = 5", [10, 5, 0, -5, -10]),
+        ("from = 1, to = 100, number = 3, spacing = 'logarithmic'", [1, 10, 100]),
+        ("from = 1, to = 1000, number = 4, spacing = 'logarithmic'", [1, 10, 100, 1000]),
+        ("from = 8, to = 27, number = 4, spacing = 'logarithmic'", [8, 12, 18, 27]),
+        ("from = 1, to = 2, number = 3", [1.0, 1.5, 2.0]),
+        ("from = 1, to = 3, number = 3, spacing = 'logarithmic'", [1.0, 3.0**0.5, 3.0]),
+        ("from = 1.0, to = 3, number = 3", [1.0, 2.0, 3.0]),
+    ],
+)
+def test_a_range_of_whole_numbers_has_whole_numbers(
+    tmp_path: Path, row: str, values: list[float]
+) -> None:
+    """Where its ends are whole and all between them is; any Integer takes either."""
+    (tmp_path / "study.toml").write_text(
+        f'system = "s.toml"\n[parameters]\n"a.n" = {{ {row} }}\n', encoding="utf-8"
+    )
+    found = [case["a.n"] for case in cases_of(load_study(tmp_path / "study.toml"))]
+    assert found == pytest.approx(values, rel=1e-12)
+    assert [type(value) for value in found] == [type(value) for value in values]
+
+
 def test_cases_in_a_file_are_taken_row_by_row(tmp_path: Path) -> None:
     """Numbers, booleans and texts; an empty cell leaves what the system has."""
     (tmp_path / "cases.csv").write_text(

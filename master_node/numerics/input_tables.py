@@ -34,12 +34,25 @@ class Table:
         derivatives: of order 0 to 3 there, shape (p, 4).
         jumps: time [s], value before and value behind, shape (q, 3).
         kinks: where the slope changes at once, shape (r,) [s].
+        extremes: smallest and largest value.
+        unit: of the values, as their file says; "" where it says none.
     """
 
     begins: FloatArray
     derivatives: FloatArray
     jumps: FloatArray
     kinks: FloatArray
+    extremes: tuple[float, float]
+    unit: str = ""
+
+    def transformed(self, factor: float, offset: float) -> Table:
+        """The table of ``factor`` * u(t) + ``offset``."""
+        sides = self.jumps * np.array([1.0, factor, factor])
+        sides[:, 1:] += offset
+        derivatives = self.derivatives * factor
+        derivatives[:, 0] += offset
+        smallest, largest = sorted(factor * value + offset for value in self.extremes)
+        return Table(self.begins, derivatives, sides, self.kinks, (smallest, largest))
 
 
 def make_table(
@@ -49,12 +62,13 @@ def make_table(
     span: tuple[float, float],
     *,
     extrapolates: bool,
+    unit: str = "",
 ) -> Table:
     """A table of n rows.
 
-    ``linear``: straight lines; two rows of the same time are a jump. ``hold``: each value holds up
-    to the next row, the last one for good. ``spline``: a cubic spline, twice differentiable
-    (not-a-knot).
+    ``linear``: straight lines; two rows of the same time are a jump, at the first and the last time
+    too. ``hold``: each value holds up to the next row, the last one for good. ``spline``: a cubic
+    spline, twice differentiable (not-a-knot).
 
     Args:
         times: shape (n,) [s].
@@ -62,6 +76,7 @@ def make_table(
         interpolation: one of `INTERPOLATIONS`.
         span: the simulated time [s].
         extrapolates: hold the first and the last value where the rows do not cover the span.
+        unit: of the values.
 
     Raises:
         InputTableError: the times do not increase, a number is not finite, there are too few
@@ -78,13 +93,14 @@ def make_table(
             "hold the first and the last value"
         )
     begins, derivatives = _pieces(times, values, interpolation)
+    extremes = _extremes(times, values, derivatives)
     if is_early:
         begins = np.concatenate([[min(span[0], times[0] - 1.0)], begins])
         derivatives = np.concatenate([[[values[0], 0.0, 0.0, 0.0]], derivatives])
-    if is_late:
+    if is_late or (interpolation == "linear" and times[-1] == times[-2]):
         begins = np.concatenate([begins, times[-1:]])
         derivatives = np.concatenate([derivatives, [[values[-1], 0.0, 0.0, 0.0]]])
-    return Table(begins, derivatives, *_breakpoints(begins, derivatives))
+    return Table(begins, derivatives, *_breakpoints(begins, derivatives), extremes, unit)
 
 
 def _check_rows(times: FloatArray, values: FloatArray, interpolation: str) -> None:
@@ -101,9 +117,9 @@ def _check_rows(times: FloatArray, values: FloatArray, interpolation: str) -> No
         repeated = steps == 0.0
         is_third = np.zeros_like(repeated)
         is_third[1:] = repeated[1:] & repeated[:-1]
-        is_outer = np.zeros_like(repeated)
-        is_outer[[0, -1]] = repeated[[0, -1]]
-        wrong = (steps < 0.0) | is_third | is_outer
+        wrong = (steps < 0.0) | is_third
+        if repeated.all():
+            raise InputTableError("all its rows have the same time")
     if wrong.any():
         row = int(np.argmax(wrong)) + 1
         raise InputTableError(
@@ -130,6 +146,23 @@ def _pieces(
 
     powers = CubicSpline(times, values).c[::-1].T
     return times[:-1], powers * np.array([1.0, 1.0, 2.0, 6.0])
+
+
+def _extremes(
+    times: FloatArray, values: FloatArray, derivatives: FloatArray
+) -> tuple[float, float]:
+    """Smallest and largest value, at the rows and where the slope of a spline is 0 between them."""
+    found = values
+    _, slope, bend, third = derivatives.T
+    if bend.any() or third.any():
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root = np.sqrt(bend * bend - 2.0 * third * slope)
+            far = -(bend + np.copysign(root, bend))  # of the two roots, without cancellation
+            offsets = np.concatenate([far / third, 2.0 * slope / far])
+        inside = (offsets > 0.0) & (offsets < np.tile(np.diff(times), 2))
+        pieces = np.tile(derivatives, (2, 1))[inside]
+        found = np.concatenate([values, _taylor(pieces, offsets[inside])])
+    return float(found.min()), float(found.max())
 
 
 def _breakpoints(begins: FloatArray, derivatives: FloatArray) -> tuple[FloatArray, FloatArray]:

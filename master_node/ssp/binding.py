@@ -30,11 +30,11 @@ from master_node.ssp.structure import (
     Value,
     each,
     element_name,
-    listed,
 )
 from master_node.ssp.transformations import apply
 from master_node.start_values import structural_parameters
 from protocol.errors import ConfigurationError, DoublestepError
+from protocol.names import listed, nearest
 from protocol.slave import SlaveDescription, Variable, VariableType
 
 Describe = Callable[[Path], SlaveDescription]
@@ -300,9 +300,9 @@ def _numbered(parameter: Parameter, items: Mapping[str, int]) -> Parameter:
         if str(item) not in items:
             raise ConfigurationError(
                 f"{parameter.place}: parameter {parameter.name!r}: Enumeration item {item!r:.60} "
-                "has no number",
-                remedy="declare the enumeration with all its items, in the file of the parameter "
-                "or for the connector of the component",
+                f"has no number{nearest(str(item), items)}",
+                remedy="correct it, or declare the enumeration with all its items, in the file of "
+                "the parameter or for the connector of the component",
             )
         return items[str(item)]
 

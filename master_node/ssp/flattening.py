@@ -25,11 +25,14 @@ from master_node.ssp.structure import (
     Transformation,
     Unit,
     Value,
-    listed,
 )
 from master_node.ssp.transformations import name_of
 from protocol.errors import ConfigurationError
 from protocol.keys import check_name
+from protocol.names import listed
+
+_SOURCES = {"output", "local", "calculatedParameter", *OPEN}
+"""Kinds of connectors of components that feed inputs."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +125,12 @@ class _Flattening:
                 self._not_driven.setdefault(source, way[0])
                 continue
             kinds = (way[0].source_connector.kind, edge.target_connector.kind)
-            if kinds[0] not in {"output", *OPEN} or kinds[1] not in {"input", *OPEN}:
+            if kinds[0] not in _SOURCES or kinds[1] not in {"input", *OPEN}:
                 raise ConfigurationError(
                     f"{edge.element.place}: a connection from kind {kinds[0]!r} to kind "
                     f"{kinds[1]!r} of components is not supported",
-                    remedy="connect outputs to inputs; give parameters as values",
+                    remedy="connect outputs, local variables or calculated parameters to inputs; "
+                    "give parameters as values",
                 )
             table: dict[str, Any] = {
                 "from": f"{self._names[source[0]]}.{source[1]}",

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 from master_node.ssp.definitions import Definitions, read_definitions, read_dimensions
-from master_node.ssp.structure import Notes, Parameter, Scalar, Transformation, Value, listed
+from master_node.ssp.structure import Notes, Parameter, Scalar, Transformation, Value
 from master_node.ssp.transformations import read_transformation
 from master_node.ssp.xml_nodes import Node, as_boolean, as_integer, as_number, boolean
+from protocol.names import listed
 
 _KINDS = {
     **dict.fromkeys(("Real", "Float64", "Float32"), "Real"),

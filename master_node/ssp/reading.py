@@ -27,14 +27,13 @@ from master_node.ssp.structure import (
     Parameter,
     Structure,
     SystemElement,
-    listed,
 )
 from master_node.ssp.transformations import read_transformation
 from master_node.ssp.xml_nodes import Node, as_integer, boolean, number, parse
 from protocol.archives import MAX_TOTAL_BYTES, MAX_XML_BYTES, checked_archive
 from protocol.errors import ModelError
 from protocol.files import is_fmu
-from protocol.names import nearest
+from protocol.names import listed, nearest
 
 SETTINGS_ANNOTATION = "org.doublestep.system"
 SETTINGS_ELEMENT = "urn:doublestep:system"

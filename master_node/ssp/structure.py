@@ -287,12 +287,6 @@ class Notes:
         )
 
 
-def listed(names: list[str]) -> str:
-    """Names for a message, all of up to ten."""
-    more = f" and {len(names) - 10} more" if len(names) > 10 else ""
-    return ", ".join(map(repr, names[:10])) + more
-
-
 def each(change: Callable[[Scalar], Value], value: Value) -> Value:
     """``change`` of a value, or of each element of an array."""
     if isinstance(value, tuple):

@@ -118,7 +118,8 @@ def _description(
         kinds: dict[str, str] = {}
         for source, target in ends:
             if source[0] == slave:
-                kinds[source[1]] = "output"
+                (first, *_) = _elements(descriptions[slave], source[1])
+                kinds[source[1]] = str(first.causality)
             if target[0] == slave:
                 kinds[target[1]] = "input"
         _add_connectors(component, kinds, descriptions[slave], settings)
@@ -133,7 +134,7 @@ def _description(
     if ends:
         connections = etree.SubElement(whole, f"{_SSD}Connections")
         for (source, target), connection in zip(ends, system.connections, strict=True):
-            _add_connection(connections, source, target, connection)
+            _add_connection(connections, source, target, connection, descriptions)
     _add_experiment(root, system)
     _add_settings(root, system)
     return _text(root)
@@ -167,6 +168,7 @@ def _add_connection(
     source: tuple[str, str],
     target: tuple[str, str],
     connection: Connection,
+    descriptions: Mapping[str, SlaveDescription],
 ) -> None:
     element = etree.SubElement(
         connections,
@@ -187,12 +189,17 @@ def _add_connection(
             offset=repr(float(connection.offset or 0.0)),
         )
     if connection.mapping is not None:
-        _add_mapping(element, connection.mapping)
+        ends = [_elements(descriptions[slave], name)[0] for slave, name in (source, target)]
+        _add_mapping(
+            element,
+            {
+                _numbered(ends[0], one): _numbered(ends[1], other)
+                for one, other in connection.mapping.items()
+            },
+        )
 
 
-def _add_mapping(
-    connection: etree._Element, mapping: Mapping[bool, bool] | Mapping[int, int]
-) -> None:
+def _add_mapping(connection: etree._Element, mapping: Mapping[StartValue, StartValue]) -> None:
     kind = "Boolean" if isinstance(next(iter(mapping)), bool) else "Integer"
     table = etree.SubElement(connection, f"{_SSC}{kind}MappingTransformation")
     for source, target in mapping.items():
@@ -255,17 +262,17 @@ def _parameter_set(
             raise ConfigurationError(f"{where}: no such variable{nearest(name, names)}")
         try:
             parameter = etree.SubElement(parameters, f"{_SSV}Parameter", name=name)
-            _add_value(parameter, value, elements[0].type, where)
+            _add_value(parameter, value, elements[0], where)
         except ValueError as error:  # characters that XML does not have
             raise ConfigurationError(f"{where}: cannot be written as XML: {error}") from None
     return _text(root)
 
 
 def _add_value(
-    parameter: etree._Element, value: GivenValue, type_: VariableType, where: str
+    parameter: etree._Element, value: GivenValue, variable: Variable, where: str
 ) -> None:
     values, sizes = _flat(value, where)
-    pairs = [_value(one, type_, where) for one in values]
+    pairs = [_value(_numbered(variable, one), variable.type, where) for one in values]
     kinds = sorted({kind for kind, _ in pairs}, key=_KINDS.index)
     kind = kinds[-1]
     if len(kinds) > 1 and not _NUMBERS.issuperset(kinds):
@@ -293,6 +300,11 @@ def _flat(value: GivenValue, where: str) -> tuple[list[StartValue], list[int]]:
             remedy="give all elements of the array",
         )
     return [one for values, _ in parts for one in values], [len(parts), *sizes[0]]
+
+
+def _numbered(variable: Variable, value: StartValue) -> StartValue:
+    """The number of an enumeration's item: SSP wants its items defined where they are named."""
+    return variable.items.get(value, value) if isinstance(value, str) else value
 
 
 def _value(value: StartValue, type_: VariableType, where: str) -> tuple[str, str]:
@@ -363,8 +375,8 @@ def _variable(
 
 
 def _text(root: etree._Element) -> bytes:
-    """The document, of version 2.0 if it has an element that 1.0 has not."""
-    if any(element.tag in _NOT_IN_1_0 for element in root.iter()):
+    """The document, of version 2.0 if it has an element or a kind that 1.0 has not."""
+    if any(e.tag in _NOT_IN_1_0 or e.get("kind") == "local" for e in root.iter()):
         root.set("version", "2.0")
     text: bytes = etree.tostring(root, encoding="UTF-8", xml_declaration=True, pretty_print=True)
     return text

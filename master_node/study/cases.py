@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice, product
 from math import isfinite, prod
 from pathlib import Path
@@ -23,6 +23,9 @@ from master_node.study.configuration import (
 )
 from protocol.errors import ConfigurationError
 from protocol.toml_text import toml_value
+
+_MOST_RATIOS = 64
+"""More equal ratios do not lie between two different integers of 64 bits."""
 
 
 def cases_of(study: Study) -> tuple[Case, ...]:
@@ -57,12 +60,34 @@ def _grid(study: Study) -> tuple[Case, ...]:
     return tuple(dict(zip(values, row, strict=True)) for row in product(*values.values()))
 
 
+def _whole_numbers(given: Range, row: Sequence[float]) -> tuple[int, ...]:
+    """The values of a range as integers, if its ends and all values between them are whole.
+
+    Exactly: floating-point numbers miss them now and then, as 10 between 1 and 100. Empty if not.
+    """
+    first, last, parts = given.begin, given.end, len(row) - 1
+    if not (isinstance(first, int) and isinstance(last, int)):
+        return ()
+    is_logarithmic = given.spacing == "logarithmic"
+    if is_logarithmic and parts > _MOST_RATIOS:
+        return ()
+    numbers = tuple(map(round, row))
+    for i, number in enumerate(numbers):
+        if is_logarithmic:
+            is_met = first ** (parts - i) * last**i == number**parts
+        else:
+            is_met = first * (parts - i) + last * i == number * parts
+        if not is_met:
+            return ()
+    return numbers
+
+
 def _values(given: Scalar | tuple[Scalar, ...] | Range) -> tuple[Scalar, ...]:
     if isinstance(given, Range):
         assert given.number is not None
         is_logarithmic = given.spacing == "logarithmic"
-        row = spaced(given.begin, given.end, given.number, logarithmic=is_logarithmic)
-        return tuple(row.tolist())
+        row = spaced(given.begin, given.end, given.number, logarithmic=is_logarithmic).tolist()
+        return _whole_numbers(given, row) or tuple(row)
     return given if isinstance(given, tuple) else (given,)
 
 

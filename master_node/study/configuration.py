@@ -52,8 +52,8 @@ class Range(_Table):
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
-    begin: Number = Field(alias="from")
-    end: Number = Field(alias="to")
+    begin: StrictInt | Number = Field(alias="from")
+    end: StrictInt | Number = Field(alias="to")
     number: Annotated[StrictInt, Field(ge=2)] | None = None
     spacing: Literal["linear", "logarithmic"] = "linear"
 

@@ -15,7 +15,6 @@ from master_node.patterns import chosen
 from master_node.results.selection import check_variables
 from master_node.results.summary import settings_sha256
 from master_node.simulation import settings_of
-from master_node.start_values import start_values
 from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.study.case import Case, apply_case
 from master_node.study.cases import cases_of
@@ -139,13 +138,7 @@ class _Check:
         check_step_sizes(with_fixed_steps(system, self._descriptions))
         if span not in self._signals:
             self._signals[span] = load_signals(system)
-        coupled = resolve(system, self._descriptions, self._signals[span])
-        for name, settings in system.slaves.items():
-            try:
-                start_values(self._descriptions[name], settings.parameters)
-            except ConfigurationError as error:
-                raise error.located(slave=name) from None
-        return coupled
+        return resolve(system, self._descriptions, self._signals[span])
 
     def _check_outputs(self, coupled: CoupledSystem) -> None:
         recorded = coupled.recorded

@@ -153,13 +153,14 @@ def _description(
 ) -> SlaveDescription:
     saves_state = interface.capabilities.can_get_and_set_state
     feed_through = _feed_through(model_description, root, variables, interface.version)
+    states = _states(model_description, variables)
     initial = _dependencies(model_description.initialUnknowns, variables)
     return SlaveDescription(
         model=model_description.modelName,
         kind=interface.kind,
         variables=variables.scalars,
         capabilities=interface.capabilities,
-        feed_through={name: inputs for name, inputs in feed_through.items() if inputs},
+        feed_through={name: inputs for name, inputs in feed_through.items() if inputs} | states,
         initial_feed_through={name: i for name, i in feed_through.items() if i} | initial,
         state_kind=StateKind.NATIVE if saves_state else StateKind.NONE,
         state_reason="" if saves_state else _NO_STATE,
@@ -188,6 +189,23 @@ def _feed_through(
     if version == 1:
         return depends | _direct_dependencies(root)
     return depends | _dependencies(model_description.outputs, variables, inputs)
+
+
+def _states(model_description: Any, variables: Variables) -> dict[str, tuple[str, ...]]:
+    """Local continuous states, which depend on no input directly, and their derivatives.
+
+    Those of derivatives are left out where the FMU does not say them: they count as all inputs.
+    """
+    depends: dict[str, tuple[str, ...]] = {}
+    for unknown in model_description.derivatives:
+        derivative = unknown.variable
+        state = derivative.derivative
+        if state is not None and state.causality == Causality.LOCAL:
+            depends |= dict.fromkeys(variables.elements[state.name], ())
+        if derivative.causality == Causality.LOCAL and unknown.dependencies is not None:
+            names = _inputs(unknown.dependencies, variables)
+            depends |= dict.fromkeys(variables.elements[derivative.name], names)
+    return depends
 
 
 def _dependencies(

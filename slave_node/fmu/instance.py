@@ -19,13 +19,14 @@ from fmpy.fmi1 import FMICallException
 
 from protocol.errors import FatalSlaveError, ModelError, SlaveError
 from protocol.names import nearest
-from protocol.slave import StartValue, VariableType
+from protocol.slave import StartValue, Variable, VariableType
+from protocol.values import value_of
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.archive import PLATFORM_FOLDERS, check_binary
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.embedded_python import forget_modules, own_modules
 from slave_node.fmu.log import FmuLog
-from slave_node.fmu.values import DiscreteExchange, ValueType, check_start_value
+from slave_node.fmu.values import DiscreteExchange, ValueType
 from slave_node.fmu.variables import Place, settable_variable
 
 OK, WARNING, DISCARD, ERROR, FATAL = range(5)
@@ -280,9 +281,10 @@ class FmuInstance(ABC):
             ModelError: a name or a value is wrong.
         """
         description, places = self.model.description, self.model.places
-        for name, value in start_values.items():
-            kind = settable_variable(description, name).type
-            check_start_value(name, places[name], self.value_type(kind, name), value)
+        start_values = {
+            name: self._start_value(settable_variable(description, name), value)
+            for name, value in start_values.items()
+        }
         arrays = {places[name].reference for name in start_values if places[name].size > 1}
         at_once = {n: v for n, v in start_values.items() if places[n].reference not in arrays}
         later: dict[str, StartValue] = {}
@@ -298,6 +300,20 @@ class FmuInstance(ABC):
             else:
                 later |= {n: v for n, v in start_values.items() if n in whole}
         return at_once, later
+
+    def _start_value(self, variable: Variable, value: StartValue) -> StartValue:
+        """The value in the type of the variable, and of C where that has fewer values."""
+        try:
+            converted = value_of(variable, value)
+        except ValueError as error:
+            raise ModelError(f"{variable.name!r} {error}") from None
+        bounds = self.value_type(variable.type, variable.name).bounds
+        if bounds and not bounds[0] <= converted <= bounds[1]:  # type: ignore[operator]
+            raise ModelError(
+                f"{variable.name!r} is of type {variable.type}, {bounds[0]} to {bounds[1]}; it "
+                f"cannot be {value!r}"
+            )
+        return converted
 
     def set_values(self, values: Mapping[str, StartValue]) -> None:
         """Set variables to checked values: of an array the elements that are named.

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from protocol.errors import ConfigurationError, ModelError, SlaveError
+from protocol.errors import ConfigurationError, SlaveError
 from protocol.slave import StartValue, VariableType
 from slave_node.fmu.variables import Place
 
@@ -266,15 +266,6 @@ class DiscreteExchange:
             _checked(name, place.type, self._types[name].bounds, value, error)
             for (name, place), value in zip(self._places.items(), values, strict=True)
         ]
-
-
-def check_start_value(name: str, place: Place, value_type: ValueType, value: StartValue) -> None:
-    """Whether the variable can have that value.
-
-    Raises:
-        ModelError: it is of another type, or beyond its bounds.
-    """
-    _checked(name, place.type, value_type.bounds, value, ModelError)
 
 
 def _checked(
