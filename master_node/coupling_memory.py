@@ -25,11 +25,24 @@ BLIND = 1.0
 """Loop gain from which on the estimate of an explicit double step is enlarged to what the loop
 makes of it."""
 
+LASTING = 0.25
+"""Loop gain that is not borne for ever: polynomials of degree 2 and 3 enlarge an error of their
+points so much that a loop with direct feed-through is at its stability limit there."""
+
 CALM = 0.1
 """Loop gain up to which explicit double steps take over again."""
 
 _PATIENCE = 3
 """Explicit double steps in a row with a large loop gain before iterated ones are tried."""
+
+_LASTING_PATIENCE = 8
+"""As many times more of them with a lasting one before that."""
+
+_RELIEF = 3
+"""Double steps with a lasting gain that one with a smaller one makes good."""
+
+_SMOOTHING = 0.2
+"""Weight of the newest H in the mean of the explicit ones."""
 
 _CALM_IN_A_ROW = 2
 """Iterated double steps in a row with a small one before explicit ones take over."""
@@ -54,30 +67,45 @@ class CouplingMemory(NamedTuple):
         is_implicit: whether double steps are iterated.
         secants: of each slave; empty before the first iteration.
         in_a_row: double steps in a row for which the other way speaks.
+        lasting: explicit double steps with a lasting loop gain, less what smaller gains made good.
         patience: explicit double steps in a row with a large loop gain that are borne.
-        explicit_step_size: H of the last explicit double step that was accepted [s].
-        poor: iterated double steps in a row that led less far for their do_steps than that.
+        explicit_step_size: mean H of the last explicit double steps that were accepted [s].
+        iterated_step_size: H of the last iterated one, since they began [s].
+        poor: iterated double steps in a row that led less far for their do_steps than explicit
+            ones; those with a larger H than the one before are not there yet, and do not count.
     """
 
     is_implicit: bool = False
     secants: tuple[Secants, ...] = ()
     in_a_row: int = 0
+    lasting: int = 0
     patience: int = _PATIENCE
     explicit_step_size: float = 0.0
+    iterated_step_size: float = 0.0
     poor: int = 0
 
     def noted(self, loop_gain: float) -> CouplingMemory:
         """With the loop gain that an explicit double step tells, accepted or not."""
-        return self._replace(in_a_row=self.in_a_row + 1 if loop_gain >= STIFF else 0)
+        lasting = self.lasting + 1 if loop_gain >= LASTING else max(0, self.lasting - _RELIEF)
+        in_a_row = self.in_a_row + 1 if loop_gain >= STIFF else 0
+        return self._replace(in_a_row=in_a_row, lasting=lasting)
+
+    def after_explicit(self, step_size: float) -> CouplingMemory:
+        """After an explicit double step of ``step_size`` H [s] was accepted."""
+        mean = self.explicit_step_size or step_size
+        mean += _SMOOTHING * (step_size - mean)
+        return self._replace(explicit_step_size=mean)
 
     @property
     def asks_for_iteration(self) -> bool:
         """Whether iterated double steps are to be tried."""
-        return not self.is_implicit and self.in_a_row >= self.patience
+        is_stiff = self.in_a_row >= self.patience
+        is_lasting = self.lasting >= _LASTING_PATIENCE * self.patience
+        return not self.is_implicit and (is_stiff or is_lasting)
 
     def iterating(self, secants: tuple[Secants, ...]) -> CouplingMemory:
         """When iterated double steps begin, with what is known of each slave."""
-        return self._replace(is_implicit=True, secants=secants, in_a_row=0)
+        return self._replace(is_implicit=True, secants=secants, in_a_row=0, lasting=0)
 
     def extrapolating(self, patience: int) -> CouplingMemory:
         """When explicit double steps take over."""
@@ -100,10 +128,13 @@ class CouplingMemory(NamedTuple):
         if calm >= _CALM_IN_A_ROW:
             return self.extrapolating(_PATIENCE)
         is_poor = step_size * _EXPLICIT_DO_STEPS < self.explicit_step_size * NODES * iterations
-        poor = self.poor + 1 if is_poor else 0
+        is_growing = step_size > self.iterated_step_size
+        poor = self.poor + (not is_growing) if is_poor else 0
         if poor >= _POOR_IN_A_ROW:
             return self.extrapolating(2 * self.patience)
-        return self._replace(secants=secants, in_a_row=calm, poor=poor)
+        return self._replace(
+            secants=secants, in_a_row=calm, iterated_step_size=step_size, poor=poor
+        )
 
 
 def explicit_jacobian(

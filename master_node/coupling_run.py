@@ -124,8 +124,7 @@ class CouplingRun(ControlledRun):
         iteration = step.iteration
         if iteration is None:
             self._statistics.stiff_double_steps += error.loop_gain >= BLIND
-            coupling = coupling._replace(explicit_step_size=step.times.step_size)
-            return position._replace(coupling=coupling)
+            return position._replace(coupling=coupling.after_explicit(step.times.step_size))
         self._statistics.iterated_double_steps += 1
         after = coupling.after_iterated(
             iteration.secants, iteration.number, step.times.step_size, iteration.loop_gain
