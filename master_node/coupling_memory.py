@@ -70,9 +70,9 @@ class CouplingMemory(NamedTuple):
         lasting: explicit double steps with a lasting loop gain, less what smaller gains made good.
         patience: explicit double steps in a row with a large loop gain that are borne.
         explicit_step_size: mean H of the last explicit double steps that were accepted [s].
-        iterated_step_size: H of the last iterated one, since they began [s].
+        iterated_step_size: the largest H of the iterated ones, since they began [s].
         poor: iterated double steps in a row that led less far for their do_steps than explicit
-            ones; those with a larger H than the one before are not there yet, and do not count.
+            ones; those with the largest H so far are not there yet, and do not count.
     """
 
     is_implicit: bool = False
@@ -128,12 +128,15 @@ class CouplingMemory(NamedTuple):
         if calm >= _CALM_IN_A_ROW:
             return self.extrapolating(_PATIENCE)
         is_poor = step_size * _EXPLICIT_DO_STEPS < self.explicit_step_size * NODES * iterations
-        is_growing = step_size > self.iterated_step_size
-        poor = self.poor + (not is_growing) if is_poor else 0
+        is_largest = step_size > self.iterated_step_size
+        poor = self.poor + (not is_largest) if is_poor else 0
         if poor >= _POOR_IN_A_ROW:
             return self.extrapolating(2 * self.patience)
         return self._replace(
-            secants=secants, in_a_row=calm, iterated_step_size=step_size, poor=poor
+            secants=secants,
+            in_a_row=calm,
+            iterated_step_size=max(step_size, self.iterated_step_size),
+            poor=poor,
         )
 
 
