@@ -14,7 +14,7 @@ from master_node.error_control import StepError
 from master_node.numerics.norms import error_scale, weighted_rms_norm
 from master_node.system import CoupledSystem
 
-TARGET = 0.43
+TARGET = 0.25
 """Local error that counts as ERR = 1, in units of the tolerance: a stiff exchange hands local
 errors on with hardly any damping, and so keeps the global one below three tolerances
 (``python -m benchmarks stiff``)."""

@@ -44,7 +44,7 @@ from protocol.signals import FloatArray
 MOST_ITERATIONS = 8
 """After so many a double step is given up, and tried again with a smaller H."""
 
-CONVERGED = 0.05
+CONVERGED = 0.01
 """Correction of the inputs, in units of their tolerances, at which an iteration ends."""
 
 _SMALLEST_SECANT = 1e-3
