@@ -18,6 +18,7 @@ from benchmarks import (
     over_zenoh,
     recovery,
     saved_states,
+    stiff,
     tls,
 )
 
@@ -73,8 +74,9 @@ CHECKS = {
     "fault_schedules": fault_schedules.main,
     "fuzz": fuzz.main,
     "nemesis": nemesis.main,
+    "stiff": stiff.main,
 }
-"""With their own options; they end with an error when something did not hold."""
+"""With their own options."""
 
 
 def main(names: list[str]) -> None:

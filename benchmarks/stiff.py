@@ -1,6 +1,6 @@
 """Stiff coupled systems: explicit, iterated and chosen double steps, with errors and costs.
 
-    python -m benchmarks stiff [--tolerances 1e-3 1e-5] [--systems NAME ...] [--most N]
+python -m benchmarks stiff [--tolerances 1e-3 1e-5] [--systems NAME ...] [--most N]
 """
 
 from __future__ import annotations

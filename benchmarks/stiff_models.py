@@ -137,7 +137,7 @@ class Ball(Model):
 
 
 class Plate(Model):
-    """A mass on a soft spring that a ball pushes through a contact a hundred thousand times stiffer.
+    """A mass on a soft spring, pushed through a contact that is a hundred thousand times stiffer.
 
     The contact is one-sided unless it is ``glued``: F = C s + D s' while s = x_ball - x > 0.
     """
@@ -347,7 +347,9 @@ class Grid(Model):
 
     def output_values(self, t: float, x: Any, u: Any) -> list[float]:
         """Machines in a triangle of lines B, with a load and a reactance X at each."""
-        phasors = [e * complex(math.cos(d), math.sin(d)) for d, e in zip(u[::2], u[1::2])]
+        phasors = [
+            e * complex(math.cos(d), math.sin(d)) for d, e in zip(u[::2], u[1::2], strict=True)
+        ]
         values = []
         for own in phasors:
             current = self.load * own + sum(-1j * self.B * (own - other) for other in phasors)

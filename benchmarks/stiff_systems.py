@@ -149,10 +149,7 @@ def reference(name: str) -> Reference:
     assert solved.success, solved.message
     every = max(1, len(solved.t) // 2000)
     values = np.array(
-        [
-            whole.outputs(t, x)
-            for t, x in zip(solved.t[::every], solved.y.T[::every], strict=True)
-        ]
+        [whole.outputs(t, x) for t, x in zip(solved.t[::every], solved.y.T[::every], strict=True)]
     )
     span = np.maximum(np.ptp(values, axis=0), np.abs(values).max(axis=0))
     return Reference(whole, solved.sol, span)
@@ -205,7 +202,10 @@ def _contact(glued: float) -> StiffSystem:
     return StiffSystem(
         {
             "ball": (stiff_models.Ball, {"v": 1.0, **start}),
-            "plate": (stiff_models.Plate, {"glued": glued, **({"v": 1.0, "m": 2.0} if glued else {})}),
+            "plate": (
+                stiff_models.Plate,
+                {"glued": glued, **({"v": 1.0, "m": 2.0} if glued else {})},
+            ),
         },
         (("ball.x", "plate.x_ball"), ("ball.v", "plate.v_ball"), ("plate.F", "ball.F")),
         2.0,

@@ -4,7 +4,7 @@ import argparse
 import importlib
 from pathlib import Path
 
-PARTS = ("paper", "beyond")
+PARTS = ("paper", "beyond", "stiff")
 DOCUMENTS = Path(__file__).parents[2] / "docs" / "reproduction"
 
 

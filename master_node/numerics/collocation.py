@@ -11,9 +11,10 @@ one earlier communication point too. Two limits decide what such a step is worth
 With `MIDDLE` = 0.7 both are A-stable for degree 2, and damped where h is large: a follower
 forgets at once (L-stable), an integrator keeps 3/7. With degree 3 they are A(80 degrees)-stable
 where the earlier point is no nearer than `NEAREST` of h; an undamped oscillation grows by up to a
-fifth in a step where it is nearer than h, as while h grows, and by 0.05 % beyond. The middle at 1/2 would have the smallest errors, but an
-integrator would keep everything (Lobatto's points lack the damping that Radau's have, Hairer and
-Wanner, *Solving ODEs II*, section IV.3); at 1/3, Radau's own node, it would grow.
+fifth in a step where it is nearer than h, as while h grows, and by 0.05 % beyond. The middle at
+1/2 would have the smallest errors, but an integrator would keep everything (Lobatto's points lack
+the damping that Radau's have, Hairer and Wanner, *Solving ODEs II*, section IV.3); at 1/3, Radau's
+own node, it would grow.
 """
 
 from __future__ import annotations
