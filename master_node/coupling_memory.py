@@ -41,17 +41,21 @@ _LASTING_PATIENCE = 8
 _RELIEF = 3
 """Double steps with a lasting gain that one with a smaller one makes good."""
 
-_SMOOTHING = 0.2
+_SMOOTHING = 0.05
 """Weight of the newest H in the mean of the explicit ones."""
 
 _CALM_IN_A_ROW = 2
 """Iterated double steps in a row with a small one before explicit ones take over."""
 
-_POOR_IN_A_ROW = 6
-"""Iterated double steps in a row that lead less far for their do_steps than explicit ones did."""
+_MOST_POOR = 6
+"""Iterated double steps that lead less far for their do_steps than explicit ones did, less those
+that lead further, before explicit ones take over."""
 
 _EXPLICIT_DO_STEPS = 3
 """That an explicit double step costs."""
+
+_WORTH = 1.5
+"""How much further iterated double steps have to lead: they cost trials, too."""
 
 _MOST_PATIENCE = 24
 """Of them at most: as often as iterated ones were not worth it, it is doubled."""
@@ -71,8 +75,9 @@ class CouplingMemory(NamedTuple):
         patience: explicit double steps in a row with a large loop gain that are borne.
         explicit_step_size: mean H of the last explicit double steps that were accepted [s].
         iterated_step_size: the largest H of the iterated ones, since they began [s].
-        poor: iterated double steps in a row that led less far for their do_steps than explicit
-            ones; those with the largest H so far are not there yet, and do not count.
+        poor: iterated double steps that led less far for their do_steps than explicit ones, less
+            those that led further; with the largest H so far they are not there yet, and do not
+            count.
     """
 
     is_implicit: bool = False
@@ -127,10 +132,11 @@ class CouplingMemory(NamedTuple):
         calm = self.in_a_row + 1 if loop_gain <= CALM else 0
         if calm >= _CALM_IN_A_ROW:
             return self.extrapolating(_PATIENCE)
-        is_poor = step_size * _EXPLICIT_DO_STEPS < self.explicit_step_size * NODES * iterations
+        explicit = self.explicit_step_size / _EXPLICIT_DO_STEPS
+        is_poor = step_size / (NODES * iterations) < _WORTH * explicit
         is_largest = step_size > self.iterated_step_size
-        poor = self.poor + (not is_largest) if is_poor else 0
-        if poor >= _POOR_IN_A_ROW:
+        poor = self.poor + (not is_largest) if is_poor else max(0, self.poor - 1)
+        if poor >= _MOST_POOR:
             return self.extrapolating(2 * self.patience)
         return self._replace(
             secants=secants,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,8 @@ from master_node.numerics.collocation import MIDDLE, NEAREST
 
 FILE = "stiff.md"
 TOLERANCES = (1e-3, 1e-5)
-MOST_EXPLICIT = 500
-"""Explicit double steps after which a run is broken off."""
+MOST = {"auto": 1500, "implicit": 1500, "explicit": 500}
+"""Double steps after which a run is broken off."""
 
 _DISTANCES = (None, NEAREST, 0.7, 1.0, 2.0, 4.0)
 _SIZES = 10.0 ** np.linspace(-3.0, 6.0, 91)
@@ -38,12 +39,8 @@ def _introduction() -> str:
 
 
 def _systems() -> str:
-    rows: list[tuple[str, ...]] = []
-    for coupling in ("auto", "implicit", "explicit"):
-        most = MOST_EXPLICIT if coupling == "explicit" else stiff.MOST
-        rows += stiff.run(TOLERANCES, most=most, couplings=(coupling,))
-    names = list(dict.fromkeys(row[0] for row in rows))
-    rows.sort(key=lambda row: (names.index(row[0]), -float(row[1])))
+    with ProcessPoolExecutor() as pool:
+        rows = [row for rows in pool.map(_rows, stiff.SYSTEMS) for row in rows]
     return paragraphs(
         "## Systems",
         "The slaves are Python models ([stiff_models.py](../../benchmarks/stiff_models.py), "
@@ -51,14 +48,24 @@ def _systems() -> str:
         "on all states at once. *do_steps* are those of the busiest slave, everything counted; "
         "*iterated* are accepted iterated double steps. The *error* is the largest one of any "
         "output at any communication point, in units of the tolerance times that output's own "
-        f"range. Explicit runs are broken off after {MOST_EXPLICIT} double steps, others after "
-        f"{stiff.MOST}.",
+        f"range. Explicit runs are broken off after {MOST['explicit']} double steps, others after "
+        f"{MOST['auto']}.",
         "An error above a hundred without a warning is a fault that is still there: in *contact* "
         "the ball meets the plate within a step, the force is over before the step ends, and no "
         "communication point sees it, so the ball does not feel the impact. A smaller "
         "`largest_step_size` does.",
         table(stiff.COLUMNS, rows),
     )
+
+
+def _rows(name: str) -> list[tuple[str, ...]]:
+    """All runs of one system."""
+    return [
+        row
+        for tolerance in TOLERANCES
+        for coupling, most in MOST.items()
+        for row in stiff.run((tolerance,), (name,), most, (coupling,))
+    ]
 
 
 def _stability() -> str:
