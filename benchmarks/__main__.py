@@ -76,7 +76,7 @@ CHECKS = {
     "nemesis": nemesis.main,
     "stiff": stiff.main,
 }
-"""With their own options."""
+"""With their own options. All but `stiff` end with an error when something did not hold."""
 
 
 def main(names: list[str]) -> None:
