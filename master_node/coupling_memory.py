@@ -21,7 +21,7 @@ STIFF = 0.6
 """Loop gain that is not borne for long. Explicit double steps lose their stability there, as the
 differences that tell the gain are larger at the end of the step than in its mean."""
 
-BLIND = 1.0
+BLIND = 0.9
 """Loop gain from which on the estimate of an explicit double step is enlarged to what the loop
 makes of it."""
 

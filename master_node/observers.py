@@ -192,7 +192,7 @@ class Statistics:
             ERR above 1 when it was too late to reject them, or behind an event on a grid of steps,
             where H could not be smaller.
         iterated_double_steps: accepted ones whose inputs were iterated.
-        stiff_double_steps: accepted explicit ones with a loop gain above 1, of which the estimate
+        stiff_double_steps: accepted explicit ones with a loop gain above 0.9, of which the estimate
             is uncertain.
         time: the last accepted communication point [s].
         smallest_step_size, largest_step_size: over accepted steps [s]; NaN before the first.

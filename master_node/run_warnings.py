@@ -51,7 +51,7 @@ def warnings_of(statistics: Statistics) -> list[str]:
     if stiff > _SHARE_OF_STIFF_STEPS * statistics.communication_steps / 2:
         warnings.append(
             f"{stiff} of {statistics.communication_steps // 2} double steps had a loop gain above "
-            "1: the coupling is stiff, and the estimate of an extrapolated step tells little "
+            "0.9: the coupling is stiff, and the estimate of an extrapolated step tells little "
             'there; use coupling = "auto" with slaves whose states can be saved and whose inputs '
             "follow input derivatives or substeps, or check against a run with lower tolerances"
         )

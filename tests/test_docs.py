@@ -171,7 +171,7 @@ def check_python(arguments: list[str]) -> list[str]:
             assert (folder / f"{name}.py").is_file() or (folder / name / "__init__.py").is_file()
             return []
         case ["-m", "benchmarks.reproduction", *parts]:
-            assert set(parts) <= {"paper", "beyond"}
+            assert set(parts) <= {"paper", "beyond", "stiff"}
             return []
         case ["-m", "pytest", *words]:
             return [word for word in words if word.startswith("tests/")]
