@@ -90,7 +90,8 @@ class CouplingRun(ControlledRun):
         if gain < BLIND:
             return error._replace(loop_gain=gain)
         enlarged = jacobian.enlargement(self._coupled.changes_of_inputs(error.estimate))
-        return error._replace(norm=enlarged * error.norm, loop_gain=gain)
+        difference = enlarged * error.difference
+        return error._replace(difference=difference, norm=enlarged * error.norm, loop_gain=gain)
 
     def _decide(
         self, position: Position, step: DoubleStep, error: StepError, target: float

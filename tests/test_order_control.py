@@ -155,14 +155,17 @@ def do_steps(path: Path, **simulation: object) -> int:
 def test_auto_is_as_good_as_the_best_fixed_polynomial(
     oscillator_dir: Path, name: str, tolerance: float
 ) -> None:
-    """At most 15 % more do_steps than the best of the fixed ones, none of which is always best."""
+    """At most 10 % more do_steps than the best of the fixed ones, none of which is always best.
+
+    A quarter more with two masses, whose loop gain enlarges estimates, of each polynomial in turn.
+    """
     path = OSCILLATORS / f"{name}.toml"
     tolerances = {"relative_tolerance": tolerance, "absolute_tolerance": tolerance}
     best = min(
         do_steps(path, order=order, derivative_points=points, **tolerances)
         for order, points in ((2, 0), (2, 1), (3, 0), (3, 1), (3, 2))
     )
-    assert do_steps(path, **tolerances) <= 1.15 * best
+    assert do_steps(path, **tolerances) <= (1.25 if name == "two_mass" else 1.10) * best
 
 
 @pytest.mark.parametrize(("tolerance", "steps", "error"), [(1e-4, 150, 3.2e-4), (1e-6, 350, 1e-5)])
