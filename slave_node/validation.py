@@ -449,6 +449,8 @@ class _Validation:
             Examine(
                 0.0,
                 self._h,
+                inputs=tuple(self._moved()[0]),
+                input_changes=tuple(self._changes()),
                 output_derivatives=self._reads_derivatives,
                 not_repeating=self._not_repeating,
             ),

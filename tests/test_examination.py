@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,8 @@ from protocol.errors import FatalSlaveError
 from protocol.slave import Causality, Examination, Slave, StateKind, StateVerdict
 from slave_node.executor import Executor
 from slave_node.loading import load_slave
+from tests.jump_models import ExactSlave
+from tests.quarter_car_case import ALL
 from tests.trial_slaves import (
     BoundedSlave,
     BrokenSlave,
@@ -106,13 +110,16 @@ def test_a_slave_with_fixed_steps_is_examined_with_these() -> None:
 
 # ---- Internal clocks ----------------------------------------------------------------------------
 
+MOVED = {"inputs": (0.0, 0.0), "input_changes": (0.01, 0.1)}
+"""Of `CHASSIS`: what waits for a tick to answer to these has a clock, however slow."""
+
 
 @given(st.floats(-2.2, 1.4), st.integers(2, 4))
 def test_every_clock_is_found_to_the_last_digit(exponent: float, digits: int) -> None:
     """Periods of few digits, from far below the trial step to far above it."""
     period = float(f"{H * 10.0**exponent:.{digits - 1}e}")
     slave = ClockedSlave(period)
-    found = examine(slave, 0.0, H)
+    found = examine(slave, 0.0, H, **MOVED)
     assert found.internal_clock == period
     assert found.state_verdict is StateVerdict.EXACT
     assert_left_as_it_was(slave)
@@ -121,7 +128,8 @@ def test_every_clock_is_found_to_the_last_digit(exponent: float, digits: int) ->
 @pytest.mark.parametrize("frequency", [60, 300, 7])
 def test_frequencies_are_found_too(frequency: int) -> None:
     """A period without few digits is the reciprocal of a whole number."""
-    assert examine(ClockedSlave(1.0 / frequency), 0.0, 0.02).internal_clock == 1.0 / frequency
+    found = examine(ClockedSlave(1.0 / frequency), 0.0, 0.02, **MOVED)
+    assert found.internal_clock == 1.0 / frequency
 
 
 @pytest.mark.parametrize("make", [TimedSlave, EulerSlave, RestartingSlave])
@@ -138,6 +146,37 @@ def test_single_events_are_no_clock() -> None:
             return sum(time >= event for event in (3 * H, 10 * H, 12 * H, 25 * H))
 
     assert examine(Eventful(H), 0.0, H).internal_clock is None
+
+
+def sampled(
+    signal: Callable[[float], float], period: float, factors: int = 0, **more: Any
+) -> float | None:
+    """The clock of a signal that is sampled at ticks, times inputs that are not; trials of 32 s."""
+
+    class Sampled(ExactSlave):
+        def read(self, t: float, x: np.ndarray, u: np.ndarray) -> list[list[float]]:
+            ticks = math.floor(t / period + 1e-9)
+            return [[signal(ticks * period) * float(np.prod(u[0]))], [0.0]]
+
+    slave = Sampled([f"u_{i}" for i in range(factors)], ("y",))
+    described(slave, capabilities=replace(ALL, max_output_derivative_order=0))
+    ones = {"inputs": (1.0,) * factors, "input_changes": (0.01,) * factors}
+    return examine(slave, 0.0, 1.0, 1e-4, 1e-4, **ones, **more).internal_clock
+
+
+@pytest.mark.parametrize("factors", [0, 1])
+@pytest.mark.parametrize("period", [0.05, 1.0, 10.0])
+def test_a_signal_that_switches_is_no_clock(period: float, factors: int) -> None:
+    """Many times or few, with a gain that follows an input at any time or without inputs."""
+    assert sampled(lambda t: float(round(t / period) % 2), period, factors) is None
+
+
+@pytest.mark.parametrize("factors", [0, 1])
+def test_fine_samples_of_a_smooth_signal_have_a_clock_and_few_ticks_have_none(factors: int) -> None:
+    """Samples of a sine from where it rises, and of a cosine from where it begins to fall."""
+    for signal in (math.sin, math.cos):
+        assert sampled(signal, 0.01, factors, largest_step=0.04) == 0.01
+        assert sampled(signal, 0.01, factors, largest_step=0.039) is None
 
 
 # ---- Step dependence ----------------------------------------------------------------------------

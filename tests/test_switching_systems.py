@@ -11,9 +11,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System
+from master_node.configure_slaves import configure
 from master_node.observers import Statistics
+from master_node.preparation import prepare
 from master_node.run_warnings import warnings_of
+from master_node.slave_group import SlaveGroup
+from master_node.slave_link import LocalSlave, SlaveLink
 from protocol.slave import Slave
+from slave_node.executor import Executor
 from tests.jump_models import Cosine, LimitedController, Product, PulseTrains, Threshold
 from tests.quarter_car_case import run_slaves
 
@@ -83,6 +88,34 @@ def test_where_signals_jump_does_not_matter(scale: float, derivatives: bool) -> 
     """Law: the result is in proportion to the time scale, wherever communication points fall."""
     result = switched_integrator(scale, derivatives, **both(1e-4))
     assert result["integrator.x"][-1] == pytest.approx(3.875 * scale, abs=1e-3 * (1.0 + scale))
+
+
+def switched_at_ticks(period: float, stop: float) -> tuple[System, dict[str, Slave]]:
+    """An integrator of a signal that is 1 in every second period and else 0."""
+    times = np.arange(1, round(stop / period) + 1) * period
+    train = [(float(time), float((i + 1) % 2)) for i, time in enumerate(times)]
+    system = System(
+        simulation={"stop_time": stop},
+        slaves={"signals": {"model": "slave"}, "integrator": {"model": "slave"}},
+        connections=[("signals.s_0", "integrator.u_0")],
+    )
+    return system, {"signals": PulseTrains([train]), "integrator": Product(1)}
+
+
+@pytest.mark.parametrize(("period", "stop"), [(1.0, 5.0), (0.3, 5.1)])
+def test_a_switch_at_equal_distances_is_put_on_no_grid(period: float, stop: float) -> None:
+    """With the defaults and trial steps: each jump is met where it is, as without these."""
+    system, slaves = switched_at_ticks(period, stop)
+    links: dict[str, SlaveLink] = {n: LocalSlave(Executor(s)) for n, s in slaves.items()}
+    loaded = {name: slave.description for name, slave in slaves.items()}
+    descriptions = configure(links, system, loaded)
+    prepared = prepare(SlaveGroup(links), system, descriptions, {})
+    assert prepared.examinations["signals"].internal_clock is None
+    assert not prepared.warnings
+    done = run_slaves(prepared.system, slaves)
+    assert done.error is None
+    on = period * (round(stop / period) // 2)
+    assert done.result["integrator.x"][-1] == pytest.approx(on, abs=1e-3)
 
 
 # ---- Inputs that are not answered ---------------------------------------------------------------

@@ -2,7 +2,8 @@
 
 Discrete outputs do not count: what changes at events is no clock of the others, and in no estimate.
 A model that moves only at multiples of a time is found by steps that are shorter than this; two of
-the moments are then bisected.
+the moments are then bisected. Signals that switch at equal distances, whatever the inputs do, are
+no clock: their jumps are met one by one.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from protocol.signals import FloatArray
 from slave_node.trials.steps import Place, Reading, TrialError, freed
 
 _COARSER = 8.0
@@ -24,6 +26,12 @@ _STEPS = 40
 _TICKS = 3
 _BISECTIONS = 24
 
+_FEWEST_TICKS = 4.0
+"""In the longest trial step, a 32nd of the run: fewer of them are jumps, each with a search."""
+
+_ALIKE = 0.75
+"""Largest difference of successive changes, relative to the larger one, in a smooth signal."""
+
 _NO_MATTER = 1e-3
 """Of the tolerance: outputs that move by less, but do move, have no clock that matters."""
 
@@ -35,7 +43,8 @@ class SlowError(Exception):
 def internal_clock(place: Place) -> float | None:
     """At multiples of which time the outputs move [s]; None if at any time, or not at all.
 
-    From the smallest steps upwards: the first ones of which any moves an output tell.
+    From the smallest steps upwards: the first ones of which any moves an output tell. Outputs that
+    switch (`_switches`) have no clock.
 
     Raises:
         SlowError: larger steps would take too long; none of those up to here tells.
@@ -44,38 +53,85 @@ def internal_clock(place: Place) -> float | None:
     for size in trial.sizes(_COARSER, 0.5 * trial.largest_step):
         before = trial.time_left
         try:
-            moves = _moves(place, size)
+            changes = _changes(place, size)
         except TrialError:  # a step that is too short, or too long, for the model
             continue
-        if moves is None or (moves and all(moves)):
+        if changes is None:
+            return None
+        moves = [bool(change.any()) for change in changes]
+        if moves and all(moves):
             return None
         if len(_clear_ticks(moves)) >= _TICKS:
             with suppress(TrialError):
-                return _period(place, size, moves)
+                period = _period(place, size, moves)
+                if period is None or not _switches(place, size, changes, period):
+                    return period
             return None
         if trial.time_left < _COARSER * (before - trial.time_left):
             raise SlowError(f"more than {size:.3g} s")
     return None
 
 
-def _moves(place: Place, size: float) -> list[bool] | None:
-    """Which steps move an output, beginning with the second one; None: all, or by little.
+def _changes(place: Place, size: float) -> list[FloatArray] | None:
+    """Changes of the outputs in steps, beginning with the second one, each of shape (n,).
 
-    Up to the third one that does so after one that does not.
+    Up to the third step that moves any after one that does not; None: they move by little.
     """
     place.restored()
     last = place.step(size)
+    changes: list[FloatArray] = []
     moves: list[bool] = []
     while len(moves) < (3 * _STEPS if any(moves) else _STEPS):
         following = place.step(size)
         has_moved = _differ(last, following)
         if has_moved and place.trial.norm(last, following) <= _NO_MATTER:
             return None
+        changes.append(following.values - last.values)
         moves.append(has_moved)
         last = following
         if len(_clear_ticks(moves)) == _TICKS or (len(moves) == _ALL_MOVE and all(moves)):
             break
-    return moves
+    return changes
+
+
+def _switches(place: Place, size: float, changes: list[FloatArray], period: float) -> bool:
+    """Whether outputs jump by themselves: no input waits for ticks, and these are few or unlike.
+
+    A grid on such ticks takes jumps for samples of something smooth: of a signal that is 1 in every
+    second period its points see a constant.
+
+    Args:
+        place: where the slave stands.
+        size: of the trial steps [s].
+        changes: of the outputs in these.
+        period: between ticks [s].
+    """
+    are_few = _FEWEST_TICKS * period > place.trial.largest_step
+    moves = [bool(change.any()) for change in changes]
+    heights = np.array(changes)[moves]
+    return (are_few or not _are_samples(heights)) and not _waits_for_ticks(place, size, moves)
+
+
+def _are_samples(heights: FloatArray) -> bool:
+    """Whether changes at successive ticks, shape (ticks, n), may be those of one smooth signal."""
+    before, behind = heights[:-1], heights[1:]
+    larger = np.maximum(np.abs(before), np.abs(behind))
+    return bool(np.all(np.abs(behind - before) <= _ALIKE * larger))
+
+
+def _waits_for_ticks(place: Place, size: float, moves: list[bool]) -> bool:
+    """Whether the slave has inputs, and its outputs do not answer to these between two ticks."""
+    trial = place.trial
+    if not trial.call.inputs:
+        return False
+    for tick in _clear_ticks(moves):
+        place.restored()
+        for _ in range(tick):
+            last = place.step(size)
+        trial.move_inputs()
+        if _differ(last, place.step(size)):
+            return False
+    return True
 
 
 def _differ(last: Reading, following: Reading) -> bool:

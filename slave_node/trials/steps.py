@@ -139,6 +139,21 @@ class Trial:
         except SlaveError as error:
             raise error.located(phase=SetInputs.verb) from None
 
+    def move_inputs(self) -> None:
+        """Let the inputs jump from their values, until the slave is set back.
+
+        Raises:
+            TrialError: it refuses them.
+        """
+        rows = np.zeros((self.call.input_order + 1, len(self.call.inputs)))
+        rows[0] = np.add(self.call.inputs, self.call.input_changes)
+        try:
+            self.slave.set_inputs(rows)
+        except FatalSlaveError:
+            raise
+        except SlaveError as error:
+            raise TrialError(f"inputs of {rows[0].tolist()}: {error.cause}") from None
+
     def ramp(self, size: float, offset: float = 0.0) -> FloatArray:
         """Inputs that begin at their values and move in ``size`` [s], shape (2, n).
 
