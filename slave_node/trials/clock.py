@@ -120,18 +120,23 @@ def _are_samples(heights: FloatArray) -> bool:
 
 
 def _waits_for_ticks(place: Place, size: float, moves: list[bool]) -> bool:
-    """Whether the slave has inputs, and its outputs do not answer to these between two ticks."""
+    """Whether the outputs answer to inputs that are moved between two ticks, and not before one."""
     trial = place.trial
     if not trial.call.inputs:
         return False
-    for tick in _clear_ticks(moves):
+
+    def after(steps: int, moved_after: int) -> Reading:
         place.restored()
-        for _ in range(tick):
-            last = place.step(size)
-        trial.move_inputs()
-        if _differ(last, place.step(size)):
-            return False
-    return True
+        for i in range(steps):
+            if i == moved_after:
+                trial.move_inputs()
+            reading = place.step(size)
+        return reading
+
+    ticks, end = _clear_ticks(moves), len(moves) + 1
+    if any(_differ(after(tick, tick), after(tick + 1, tick)) for tick in ticks):
+        return False
+    return any(_differ(after(end, end), after(end, tick)) for tick in ticks)
 
 
 def _differ(last: Reading, following: Reading) -> bool:
