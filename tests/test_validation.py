@@ -155,6 +155,7 @@ CAPABILITIES = {
         ),
     ),
     "discards": replace(LAG, steps="do_step: discard at t=0.002 s; steps of 0.001 s are taken"),
+    "accident": LAG,
     "large_state": LAG,
     "internal_clock": replace(HELD, clock="outputs move only at multiples of 0.01 s", halves=""),
     "euler_per_step": replace(HELD, halves="differ by "),
