@@ -71,6 +71,12 @@ class BrokenStepError(StepRejectedError):
     def __init__(self, original: DoublestepError) -> None:
         super().__init__(original.cause, remedy=original.remedy)
         self.original = original
+        self.located(
+            slave=original.slave,
+            phase=original.phase,
+            time=original.time,
+            step_size=original.step_size,
+        )
 
     @property
     def is_crash(self) -> bool:
