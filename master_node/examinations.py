@@ -30,6 +30,7 @@ from protocol.calls import Configure, Examine, GetState, Reply, SetInputs, SetSt
 from protocol.errors import ConfigurationError, FatalSlaveError, SlaveCrashedError, SlaveError
 from protocol.signals import FloatArray
 from protocol.slave import (
+    SUBSTEP_ERROR,
     Causality,
     Examination,
     InputDerivatives,
@@ -276,7 +277,11 @@ def remedy(
         else:
             largest = _rounded_down(examination.largest_substep)
             configuration = replace(configuration, largest_substep=largest)
-            warnings.append(f"{what}; its steps are split into substeps of {largest!r} s at most")
+            warnings.append(
+                f"{what}; its steps are split into substeps of {largest!r} s at most; up to "
+                f"{SUBSTEP_ERROR:g} of the tolerance may be left in each and adds up unseen: "
+                "compare with a smaller 'largest_substep'"
+            )
     if examination.not_tried:
         warnings.append(f"{name}: its trial steps take long: {examination.not_tried}")
     return Remedy(configuration, settings, tuple(warnings))

@@ -300,8 +300,8 @@ class Examination:
         internal_clock: the outputs move only at multiples of this [s]; None: no such clock.
         step_dependence: how much a step of 2h differs from two of h, weighted by the tolerance:
             far above 1 if the model takes one step of its own in each do_step.
-        largest_substep: steps of the model up to this keep that difference within the tolerance
-            [s]; None: there is no need.
+        largest_substep: steps of the model up to this keep that difference within `SUBSTEP_ERROR`
+            of the tolerance [s]; None: there is no need.
         input_order: highest order of input derivatives that it takes; None: all that were tried.
         input_refusal: why it takes no higher ones; "" if it does. Nothing else was tried then.
         not_repeating: outputs that no other slave depends on, and that were others each time the
@@ -323,6 +323,10 @@ class Examination:
     not_repeating: tuple[str, ...] = ()
     poor_derivatives: Mapping[str, str] = field(default_factory=dict)
     not_tried: str = ""
+
+
+SUBSTEP_ERROR = 0.1
+"""Of the tolerance: the errors of the substeps of a communication step add up."""
 
 
 class Slave(ABC):

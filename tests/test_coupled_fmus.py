@@ -9,6 +9,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+import numpy as np
 import pytest
 
 from benchmarks import coupled
@@ -16,6 +17,7 @@ from benchmarks.corpus.models import distinct_models
 from benchmarks.coupled.measurement import (
     Measured,
     Scale,
+    extrapolated,
     find_reference,
     measure,
     run_fixed,
@@ -100,12 +102,21 @@ def test_halving_goes_on_until_nothing_changes(quarter_car: CoupledFmus, fmu_dir
     """Without time there are two runs only, and the change tells how far the reference is."""
     fmus = {name: str(fmu_dir / f"{name}.fmu") for name in ("chassis", "wheel")}
     system = system_of(quarter_car, fmus)
-    scale = Scale(system)
+    scale = Scale(quarter_car, system)
     early = find_reference(system, scale, 0.0)
     assert early.steps == 2 * 97
     change, _ = scale.error(run_fixed(system, 97, 1), early.values)
     assert early.change == change
     assert find_reference(system, scale, monotonic() + 60.0).change < change
+
+
+def test_extrapolation_takes_away_three_terms_of_the_error() -> None:
+    """Values that are a cubic polynomial of H, at H = 1, 1/2, 1/4 and 1/8: the value at H = 0."""
+    cubic = np.polynomial.Polynomial([1.0, -2.0, 3.0, 5.0])
+    row: list[np.ndarray] = []
+    for halving in range(4):
+        row = extrapolated(row, np.array([[cubic(0.5**halving)]]))
+    assert row[-1] == pytest.approx(1.0, abs=1e-12)
 
 
 def test_what_is_wrong_without_a_warning_is_told() -> None:

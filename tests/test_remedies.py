@@ -271,7 +271,7 @@ def test_one_euler_step_per_do_step_is_split_into_substeps() -> None:
     assert largest == float(f"{largest:.1e}")
     held, warning = prepared.warnings
     assert "its input derivatives are emulated" in held  # it takes the values only
-    assert f"substeps of {largest!r} s at most" in warning
+    assert f"substeps of {largest!r} s at most; up to 0.1 of the tolerance" in warning
     assert prepared.examinations["chassis"].step_dependence < 1.0  # as it is now
 
 
@@ -430,6 +430,20 @@ def test_a_clock_without_its_grid_costs_steps_and_accuracy(capability_dir: Path)
     assert error < 3e-3  # of the Euler steps of 10 ms
     assert blind > 3.0 * error
     assert summary["communication_steps"] < 0.1 * blind_summary["communication_steps"]
+
+
+def test_what_is_left_of_euler_steps_is_told_and_its_remedy_helps(
+    capability_dir: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """More than ten tolerances are left, no estimate sees them, and shorter substeps leave less."""
+    tolerances = {"relative_tolerance": 1e-6, "absolute_tolerance": 1e-6}
+    system = lags(capability_dir, "euler_per_step", **tolerances)
+    error, _ = lag_error(system)
+    (told,) = {r.getMessage() for r in caplog.records if "adds up unseen" in r.getMessage()}
+    assert error > 1e-5
+    substep = float(told.partition("substeps of ")[2].split()[0])
+    finer = system.with_slave("a", largest_substep=substep / 8.0)
+    assert lag_error(finer)[0] < 0.5 * error  # the rest is that of the coupling
 
 
 def test_a_clock_too_slow_for_the_tolerance_is_said_so(capability_dir: Path) -> None:

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 
 Value = float | bool
 
+Table = tuple[tuple[float, ...], tuple[float, ...]]
+"""Times [s] and values, joined by straight lines."""
+
 
 @dataclass(frozen=True, slots=True)
 class Slave:
@@ -32,16 +35,19 @@ class CoupledFmus:
         slaves: by name.
         connections: source and target of each, ``slave.variable``.
         stop_time: [s].
-        inputs: constants by ``slave.variable``.
-        ignore_units: of all connections, where exporters wrote different names for one unit.
+        inputs: constants and tables by ``slave.variable``.
+        points: values are compared at so many times and the start. By default a prime, so that
+            few of them are events.
+        jumps: times at which signals are known to jump; values are not compared there [s].
     """
 
     repository: str
     slaves: Mapping[str, Slave]
     connections: tuple[tuple[str, str], ...]
     stop_time: float
-    inputs: Mapping[str, float] = field(default_factory=dict)
-    ignore_units: bool = False
+    inputs: Mapping[str, float | Table] = field(default_factory=dict)
+    points: int = 97
+    jumps: tuple[float, ...] = ()
 
 
 _DUAL_MASS = tuple((f"system1.{name}", f"system2.{name}") for name in ("a1", "v1", "x1"))
@@ -63,7 +69,9 @@ SYSTEMS: Mapping[str, CoupledFmus] = {
             "part3": Slave("Part3.fmu", "8d1f3edc"),
         },
         (*_INTEGRATOR, ("part3.x4", "part2.x4")),
-        5.0,
+        4.0,
+        points=64,
+        jumps=(1.0, 2.0, 3.0, 4.0),
     ),
     "switched integrator of two tools": CoupledFmus(
         "ghorwin/MasterSim",
@@ -73,7 +81,9 @@ SYSTEMS: Mapping[str, CoupledFmus] = {
             "part3": Slave("Part3.fmu", "da69f280"),
         },
         (*_INTEGRATOR, ("part3._D_outputStateAlias_x4", "part2.x4")),
-        5.0,
+        4.0,
+        points=64,
+        jumps=(1.0, 2.0, 3.0, 4.0),
     ),
     "two masses": CoupledFmus(
         "OpenModelica/OMSimulator",
@@ -153,8 +163,9 @@ SYSTEMS: Mapping[str, CoupledFmus] = {
             "drivetrain": Slave("Drivetrain.fmu", "57da67ce"),
         },
         (("drivetrain.w", "controller.u_m"), ("controller.y", "drivetrain.tau")),
-        1.0,
-        {"controller.u_s": 1.0},
+        2.0,
+        {"controller.u_s": ((0.0, 0.5, 2.0), (0.0, 1.0, 1.0))},
+        points=100,
     ),
     "dc motor": CoupledFmus(
         "OpenModelica/OMSimulator",

@@ -11,6 +11,7 @@ from math import log
 
 import numpy as np
 
+from protocol.slave import SUBSTEP_ERROR
 from slave_node.trials.clock import SlowError
 from slave_node.trials.steps import Place, Reading, TrialError
 
@@ -18,9 +19,6 @@ _LARGER = 4.0
 """From one h to the next."""
 
 _NOTICED = 1.0
-_ALLOWED = 0.1
-"""Of the tolerance: the errors of the substeps of a communication step add up."""
-
 _HALVINGS = 14
 
 
@@ -46,7 +44,7 @@ def step_dependence(place: Place) -> tuple[float, float | None]:
     """How much one step of 2h differs from two of h, and up to which h it does not matter [s].
 
     That difference is looked for with larger and larger h. When it is more than the tolerance h is
-    halved until it is `_ALLOWED` of it; None where there is no need, or no such h.
+    halved until it is `SUBSTEP_ERROR` of it; None where there is no need, or no such h.
 
     Raises:
         SlowError: larger steps would take too long, and up to here there is no such difference.
@@ -85,7 +83,9 @@ def _allowed_size(place: Place, size: float, difference: float) -> float | None:
         for _ in range(_HALVINGS):
             size *= 0.5
             last, difference = difference, _halves(place, size)
-            if difference <= _ALLOWED:  # between this size and twice of it, by a power law
-                room = log(_ALLOWED / difference) / log(last / difference) if difference else 0.0
+            if difference <= SUBSTEP_ERROR:  # between this size and twice of it, by a power law
+                room = (
+                    log(SUBSTEP_ERROR / difference) / log(last / difference) if difference else 0.0
+                )
                 return float(size * 2.0**room)
     return None
