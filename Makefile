@@ -1,4 +1,4 @@
-# make demo | test | slow | check: each makes its own environment in .venv first, from nothing.
+# make demo | test | slow | sample | check: each makes its own environment in .venv first, from nothing.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 DEVELOPED := $(VENV)/.developed
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
-.PHONY: demo test slow check fmus benchmark reproduce format clean
+.PHONY: demo test slow sample check fmus benchmark reproduce format clean
 
 demo: fmus ## the paper's quarter car: two FMU processes, one master, over Zenoh
 	$(BIN)/master-node run examples/quarter_car/displacement.toml --output demo_results
@@ -16,6 +16,10 @@ test: $(DEVELOPED) fmus ## all tests but the slow ones
 
 slow: $(DEVELOPED) fmus ## the slow tests: more seeds, more cycles, more hosts
 	$(PYTEST) -m slow
+
+SEED := $(shell git rev-parse --short=8 HEAD 2>/dev/null)
+sample: $(DEVELOPED) fmus ## some of the slow tests, others for each commit
+	$(PYTEST) -m slow --sample 5 --seed "$(SEED)"
 
 check: $(DEVELOPED) ## linter, formatter, type checker, import layers
 	$(BIN)/ruff check .

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 
 # Threads only get in each other's way on matrices of a few rows. Read where NumPy is imported.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -241,3 +242,20 @@ def no_process_left(survivors: Survivors) -> Iterator[None]:
     for process in left:
         process.kill()
     assert not left, f"processes are left running: {left}"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--sample N --seed TEXT``: N of the tests that are chosen, others for each seed."""
+    parser.addoption("--sample", type=int, default=None, help="run so many of the chosen tests")
+    parser.addoption("--seed", default="", help="that the sample is drawn by")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep the sample; all workers draw the same."""
+    number = config.getoption("--sample")
+    if number is None or number >= len(items):
+        return
+    chosen = set(random.Random(config.getoption("--seed")).sample(range(len(items)), number))
+    config.hook.pytest_deselected(items=[i for n, i in enumerate(items) if n not in chosen])
+    items[:] = [item for n, item in enumerate(items) if n in chosen]
