@@ -606,6 +606,8 @@ class ControlledRun:
         self._checkpoints.settle()
         self._statistics.discontinuities += 1
         self._statistics.double_steps_at_discontinuities += 1
+        if self._limits.quantum is not None and error.norm > 1.0:
+            self._note_above_tolerance(step, error)
         times = step.times
         reached = _reached(step)
         error = error._replace(limiting_variable=name)
@@ -641,8 +643,16 @@ class ControlledRun:
         self, position: Position, step: DoubleStep, error: StepError, defects: Defects | None
     ) -> Position:
         """Cross what follows an event: with the smallest H of a grid there is no other way."""
-        statistics = self._statistics
-        if not statistics.steps_above_tolerance:
+        self._note_above_tolerance(step, error)
+        self._statistics.double_steps_at_discontinuities += 1
+        following = self._accept(position, step, error, defects)
+        if following.crossings >= self._crossings_behind_event[1]:
+            return following._replace(history=following.history.cut())
+        return following
+
+    def _note_above_tolerance(self, step: DoubleStep, error: StepError) -> None:
+        """Count a double step that is kept on a grid whatever its error is; tell the first one."""
+        if not self._statistics.steps_above_tolerance:
             log.warning(
                 "behind an event, at t=%r s, a double step is kept with ERR = %.3g, most of it "
                 "from %s: its polynomials have no past, and H cannot be below %r s; "
@@ -652,12 +662,7 @@ class ControlledRun:
                 error.limiting_variable,
                 step.times.step_size,
             )
-        statistics.steps_above_tolerance += 1
-        statistics.double_steps_at_discontinuities += 1
-        following = self._accept(position, step, error, defects)
-        if following.crossings >= self._crossings_behind_event[1]:
-            return following._replace(history=following.history.cut())
-        return following
+        self._statistics.steps_above_tolerance += 1
 
     def _jumps(self, position: Position, step: DoubleStep, error: StepError) -> _Jumps:
         """The inputs that jump in a double step, as far as defects tell."""

@@ -166,11 +166,11 @@ class Packages:
         """What is read of a package."""
         return self.read_file(self.write(description, **files))
 
-    def read_file(self, path: Path) -> ImportedSystem:
+    def read_file(self, path: Path, *, package_bus: bool = False) -> ImportedSystem:
         """What is read of a file."""
         scratch = self.folder / f"scratch-{len(list(self.folder.iterdir()))}"
         scratch.mkdir()
-        return read_ssp(path, scratch)
+        return read_ssp(path, scratch, package_bus=package_bus)
 
     def refusal(self, description: str | bytes, **files: str | bytes | Path) -> str:
         """Why it is refused."""

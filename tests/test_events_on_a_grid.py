@@ -49,7 +49,7 @@ def pushed(folder: Path, source: str, step_multiple: float | None, estimator: st
     (folder / "models.py").write_text(MODELS, encoding="utf-8")
     grid = {} if step_multiple is None else {"step_multiple": step_multiple}
     system = System(
-        simulation={"stop_time": 0.6, "estimator": estimator},
+        simulation={"stop_time": 0.6, "estimator": estimator, "coupling": "explicit"},
         slaves={
             "half": {"model": "models.py:Gain", "parameters": {"k": 0.5}},
             "minus": {"model": "models.py:Gain", "parameters": {"k": -1.0}, **grid},

@@ -122,7 +122,8 @@ def test_the_description_says_what_the_file_says(capability_dir: Path) -> None:
     assert wheel.variable("m").type is VariableType.FLOAT64
     assert wheel.variable("m").unit == "kg"
     assert wheel.units["N.s/m"].exponents == (1, 0, -1, 0, 0, 0, 0, 0)
-    assert wheel.feed_through == {}
+    outputs = [v.name for v in wheel.variables if v.causality is Causality.OUTPUT]
+    assert wheel.feed_through.keys().isdisjoint(outputs)
     assert wheel.default_step_size == 0.001
     assert wheel.fixed_step_size is None
     assert wheel.capabilities.can_get_and_set_state
@@ -315,7 +316,11 @@ def test_a_value_of_another_type_is_refused(
         slave.set_discrete_inputs((value,))
     with pytest.raises(SlaveError, match="2 discrete values for 1 variables"):
         slave.set_discrete_inputs((value, value))
-    if not isinstance(value, float):
+    # Start values of a system file are converted where nothing is lost: 1 is true, red an item.
+    if not isinstance(value, float) and (name, value) not in (
+        ("boolean_in", 1),
+        ("enumeration_in", "red"),
+    ):
         with pytest.raises(ModelError, match=message):
             initialized(load("all_types3"), start_values={name: value})
 

@@ -363,7 +363,7 @@ def slave_agent(world: World) -> str:
     instance = agent.text.rpartition("instance ")[2].strip()
     request = {
         **{"run": "r", "host": EVIL, "pid": 1, "orphan_time": 1.0, "slave": "s", "model": EVIL},
-        **{"requires": {}, "restart": 0},
+        **{"requires": {}, "restart": 0, "load_timeout": 1.0},
     }
     world.ask(AgentKey("lab", instance).verb(START), request)
     agent.wait_for("refused")

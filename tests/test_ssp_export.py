@@ -111,10 +111,10 @@ def test_export_and_import_lose_nothing(full: Path, packages: Packages) -> None:
     given = with_whole_transformations(tables(load_system(full)))
     package = packages.folder / "full.ssp"
     export_system(full, package)
-    read = packages.read_file(package)
+    read = packages.read_file(package, package_bus=True)
     assert read.notes == ()
     assert tables(read.system) == given
-    assert import_system(package, packages.folder / "again.toml") == ()
+    assert import_system(package, packages.folder / "again.toml", package_bus=True) == ()
     again = load_system(packages.folder / "again.toml")
     assert tables(again) == given
     assert {s.model for s in again.slaves.values()} == {
@@ -339,7 +339,7 @@ def test_what_is_exported_is_imported_as_it_was(
         folder / "law.ssp",
     )
     (folder / "scratch").mkdir()
-    read = read_ssp(folder / "law.ssp", folder / "scratch")
+    read = read_ssp(folder / "law.ssp", folder / "scratch", package_bus=True)
     assert tables(read.system) == with_whole_transformations(tables(system))
     assert read.notes == ()
 

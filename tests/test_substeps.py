@@ -408,6 +408,7 @@ def test_emulated_inputs_are_as_good_as_native_ones(
         "relative_tolerance": tolerance,
         "absolute_tolerance": tolerance,
         "derivative_points": 0,
+        "coupling": "explicit",
     }
     native = simulate(car("chassis.fmu", "wheel.fmu", base=fmu_dir, **settings), in_process=True)
     held = car(

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from master_node.remote_slave import RemoteSlave
+from master_node.request_bounds import RequestBounds
 from master_node.survey import survey
 from protocol import codec
 from protocol.administration import Claim, Claimed, MasterStatus, RouterStatus
@@ -198,7 +199,7 @@ def test_a_slave_that_answers_a_claim_with_nonsense_is_refused(answer: dict[str,
     bus, key = InProcessBus(), SlaveKey("wheel", "0")
     bus.serve(key.verb(CLAIM), lambda _: encode_map(answer))
     with pytest.raises(MalformedMessageError):
-        RemoteSlave(bus, key, run="r", step_timeout=1.0, reconnect_time=1.0)
+        RemoteSlave(bus, key, run="r", bounds=RequestBounds(1.0, 1.0, 1.0), reconnect_time=1.0)
 
 
 # ---- Names --------------------------------------------------------------------------------------
