@@ -28,7 +28,7 @@ from protocol.calls import (
     SetState,
 )
 from protocol.endpoints import free_endpoint
-from protocol.errors import DeadlineError
+from protocol.errors import DeadlineError, DoublestepError
 from protocol.slave import SlaveDescription, StateKind
 from tests.test_processes import Start, start
 
@@ -89,6 +89,24 @@ def test_a_failed_end_in_process_is_told_too(
     result = simulate(system, in_process=True)
     assert result.summary["outcome"] == "completed"
     assert ("an accident" in result.summary["message"]) == (function == "fmi2Terminate")
+
+
+@pytest.mark.parametrize(("accident", "outcome"), [("error", "completed"), ("crash", "")])
+def test_an_fmu_that_refuses_a_choice_of_its_log_runs_all_the_same(
+    accident: str,
+    outcome: str,
+    tmp_path: Path,
+    capability_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What it logs is no part of what it computes; a crash there is one."""
+    monkeypatch.setenv("ACCIDENT", f"fmi2SetDebugLogging {accident}")
+    system = load_system(lag_file(tmp_path, capability_dir))
+    if outcome:
+        assert simulate(system).summary["outcome"] == outcome
+    else:
+        with pytest.raises(DoublestepError, match="died by SIGSEGV"):
+            simulate(system)
 
 
 # ---- Waits --------------------------------------------------------------------------------------

@@ -30,7 +30,14 @@ from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer
 from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, reference_array
-from slave_node.fmu.log import LOGGER_1, add_proxy, instantiating, register, unregister
+from slave_node.fmu.log import (
+    LOGGER_1,
+    add_proxy,
+    choose_categories,
+    instantiating,
+    register,
+    unregister,
+)
 from slave_node.fmu.values import ValueType
 
 _TEXTS = ("fmi1GetVersion", "fmi1GetTypesPlatform")
@@ -73,7 +80,7 @@ class Fmi1Instance(FmuInstance):
         if self.fmu.component is None:
             raise RuntimeError("Failed to instantiate model")
         register(self.fmu.component, self.log)
-        self.fmu.setDebugLogging(log_all)
+        choose_categories(self.fmu.setDebugLogging, log_all)
 
     def c_name(self, name: str) -> str:
         """See `FmuInstance`: the names of FMI 1.0 begin with the model identifier."""

@@ -23,7 +23,14 @@ from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer
 from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, reference_array
-from slave_node.fmu.log import LOGGER_2, add_proxy, register, unregister, wanted_categories
+from slave_node.fmu.log import (
+    LOGGER_2,
+    add_proxy,
+    choose_categories,
+    register,
+    unregister,
+    wanted_categories,
+)
 from slave_node.fmu.values import ValueType
 
 _STEP_OK = StepStatus.OK
@@ -64,7 +71,7 @@ class Fmi2Instance(FmuInstance):
         try:
             self.fmu.instantiate(callbacks=callbacks, loggingOn=log_all or bool(wanted))
             if wanted:
-                self.fmu.setDebugLogging(True, wanted)
+                choose_categories(self.fmu.setDebugLogging, True, wanted)
         except Exception:
             unregister(self.log)
             raise

@@ -21,7 +21,7 @@ from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL_3, ArrayExchangeBuffer, InputPolynomials
 from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import ADDRESS, DISCARD, ERROR, WARNING, FmuInstance
-from slave_node.fmu.log import FmuLog, wanted_categories
+from slave_node.fmu.log import FmuLog, choose_categories, wanted_categories
 from slave_node.fmu.saved_state import SavedState, pack, unpack
 from slave_node.fmu.times import is_at_border, meet
 from slave_node.fmu.values import ValueType
@@ -75,7 +75,7 @@ class Fmi3Instance(FmuInstance):
         wanted = wanted_categories(list(self.model.log_categories), log_all=log_all)
         self._instantiate_interface(loggingOn=log_all or bool(wanted), logMessage=_logger(self.log))
         if wanted:
-            self.fmu.setDebugLogging(True, wanted)
+            choose_categories(self.fmu.setDebugLogging, True, wanted)
 
     def _instantiate_interface(self, **arguments: Any) -> None:
         self.fmu.instantiate(**arguments)

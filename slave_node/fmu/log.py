@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import ctypes
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from fmpy.fmi1 import fmi1CallbackLoggerTYPE
+from fmpy.fmi1 import FMICallException, fmi1CallbackLoggerTYPE
 from fmpy.fmi2 import fmi2CallbackLoggerTYPE
 from fmpy.logging import addLoggerProxy
 
 _LINES = 20
 _SHOWN = 5
+_FATAL = 4
 UNNAMED = ""
 _ERROR_CATEGORIES = {
     *("logStatusWarning", "logStatusDiscard", "logStatusError", "logStatusFatal"),
@@ -44,6 +45,19 @@ class FmuLog:
 def wanted_categories(names: list[str], *, log_all: bool) -> list[str]:
     """Those of an FMU's log categories that are asked for: all, or those of its errors."""
     return [name for name in names if log_all or name in _ERROR_CATEGORIES]
+
+
+def choose_categories(choose: Callable[..., object], *arguments: object) -> None:
+    """Call fmiSetDebugLogging; an FMU that refuses goes on with the log that it has.
+
+    Raises:
+        FMICallException: the FMU cannot go on.
+    """
+    try:
+        choose(*arguments)
+    except FMICallException as error:
+        if error.status == _FATAL:
+            raise
 
 
 # ---- FMI 1.0 and 2.0: messages with arguments, formatted by fmpy's proxy -----------------------
