@@ -221,6 +221,7 @@ def test_the_same_bits_with_slaves_of_two_agents(  # noqa: PLR0917  fixtures
         assert "ended " in agent.text
 
 
+@pytest.mark.slow
 def test_an_agent_has_the_model_that_is_not_here(
     start_agent: StartAgent, tmp_path: Path, fmu_dir: Path, reference: bytes, endpoint: str
 ) -> None:
@@ -266,6 +267,7 @@ def test_a_model_that_is_exchanged_on_the_way_is_found_out(
         simulate(load_system(file))
 
 
+@pytest.mark.slow
 def test_python_models_need_permission_and_the_same_file(
     start: Commands, start_agent: StartAgent, tmp_path: Path, fmu_dir: Path, endpoint: str
 ) -> None:
@@ -311,6 +313,7 @@ def long_wheel(tmp_path: Path, fmu_dir: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_model_is_sent_once_and_only_with_permission(
     start_agent: StartAgent, tmp_path: Path, fmu_dir: Path, long_wheel: Path, endpoint: str
 ) -> None:
@@ -353,6 +356,7 @@ def test_a_model_is_sent_once_and_only_with_permission(
     assert results[0] == results[1]
 
 
+@pytest.mark.slow
 def test_the_folder_of_an_fmu_is_sent_packed(
     start_agent: StartAgent, tmp_path: Path, fmu_dir: Path, endpoint: str, reference: bytes
 ) -> None:
@@ -809,6 +813,7 @@ def test_what_an_agent_lacks() -> None:
 # ---- Licences and names --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_master_waits_for_a_licence_and_says_who_has_it(
     start: Commands, start_agent: StartAgent, tmp_path: Path, fmu_dir: Path
 ) -> None:
@@ -1052,6 +1057,7 @@ def test_a_slave_that_is_lost_is_started_again_elsewhere_if_need_be(  # noqa: PL
     assert slave_processes(agents["b"]) == {}
 
 
+@pytest.mark.slow
 def test_an_agent_that_stops_while_it_is_asked_to_start_a_slave(
     start_agent: StartAgent, tmp_path: Path, fmu_dir: Path, endpoint: str, reference: bytes
 ) -> None:

@@ -225,6 +225,7 @@ def test_documents_within_the_limits_are_taken() -> None:
 INCLUSION = "http://www.w3.org/2001/XInclude"
 
 
+@pytest.mark.slow
 def test_what_a_document_wants_to_include_is_not_read(tmp_path: Path) -> None:
     """XInclude names a file, and nothing of it is in any message or result."""
     secret = tmp_path / "secret.xml"

@@ -201,6 +201,7 @@ def test_trial_steps_go_on_without_derivatives(
     assert any(text in line for line in said.lines)
 
 
+@pytest.mark.slow
 def test_a_run_with_missing_derivatives_is_resumed_bit_for_bit(
     capability_dir: Path, tmp_path: Path
 ) -> None:
@@ -339,6 +340,7 @@ class Kill:
 
 
 @pytest.mark.usefixtures("no_process_left")
+@pytest.mark.slow
 def test_a_slave_with_clocks_is_restored_after_a_kill(capability_dir: Path, tmp_path: Path) -> None:
     """What does not repeat is not compared when a process takes the place of another one."""
     system = lags(capability_dir, "clocks")

@@ -990,6 +990,7 @@ def test_archives_hold_their_sources(capability_dir: Path) -> None:
         assert not any("doublestep_absent" in name for name in names)
 
 
+@pytest.mark.slow
 def test_build_is_reproducible(capability_dir: Path, tmp_path: Path) -> None:
     """The same sources give the same bytes, those of the stand-in library included."""
     catalogue = sys.modules["capabilities.catalogue"]

@@ -146,6 +146,7 @@ def test_a_row_says_what_was_found() -> None:
     assert coupled.row(BASE | {"outcome": "refused", "message": "no"})[2:4] == ("refused: no", "")
 
 
+@pytest.mark.slow
 def test_a_folder_is_measured(
     quarter_car: CoupledFmus,
     fmu_dir: Path,

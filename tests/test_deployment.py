@@ -272,6 +272,7 @@ def container_of_pod(name: str) -> tuple[list[str], list[str]]:
     "containers",
     [containers_of_compose, pytest.param(containers_of_kubernetes, marks=pytest.mark.slow)],
 )
+@pytest.mark.slow
 def test_the_commands_of_the_containers_simulate_the_quarter_car(
     processes: Processes, tmp_path: Path, containers: Any
 ) -> None:
@@ -313,6 +314,7 @@ def agent_of_kubernetes() -> tuple[list[str], list[str]]:
 @pytest.mark.parametrize(
     "agent", [pytest.param(agent_of_compose, marks=pytest.mark.slow), agent_of_kubernetes]
 )
+@pytest.mark.slow
 def test_the_agent_of_the_containers_starts_slaves(
     processes: Processes, tmp_path: Path, agent: Any
 ) -> None:
@@ -514,6 +516,7 @@ def test_a_unit_can_do_no_more_than_it_must(path: Path) -> None:
     shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze here"
 )
 @pytest.mark.parametrize("path", UNITS, ids=[path.name for path in UNITS])
+@pytest.mark.slow
 def test_systemd_finds_nothing_wrong(path: Path, tmp_path: Path) -> None:
     """Its own check of keys and values, and its own measure of what a service could do: 2 of 10."""
     text = path.read_text(encoding="utf-8")

@@ -324,6 +324,7 @@ def test_what_documents_import_is_there(path: Path) -> None:
 OUR_MODULES = ("master_node", "slave_node.model")
 
 
+@pytest.mark.slow
 def test_a_slave_is_driven_by_hand_as_the_protocol_says(
     fmu_dir: Path, endpoint: str, tmp_path: Path, no_process_left: None
 ) -> None:

@@ -137,6 +137,7 @@ def test_a_run_gives_the_same_file_however_states_are_saved(
     assert len(files) == 1
 
 
+@pytest.mark.slow
 def test_real_slave_processes_write_the_same_file(fmu_dir: Path, tmp_path: Path) -> None:
     """Over Zenoh, each slave a node, a worker and a family of holders."""
     files = {results(car(fmu_dir, "native"), tmp_path / "here", "native", in_process=True)} | {

@@ -94,6 +94,7 @@ def reference(folder: Path) -> bytes:
     return (folder / "reference" / "out" / "results.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_cut_cable_is_ridden_out(start: Commands, hosts: Hosts, tmp_path: Path) -> None:
     """A direct connection, cut in mid step for longer than the lease: one warning, same bits."""
     where = f"tcp/{hosts.addresses['master']}:7447"
@@ -119,6 +120,7 @@ def test_a_cut_cable_is_ridden_out(start: Commands, hosts: Hosts, tmp_path: Path
     slave.wait_for("released by")
 
 
+@pytest.mark.slow
 def test_a_cable_that_stays_cut_ends_the_run(start: Commands, hosts: Hosts, tmp_path: Path) -> None:
     """After ``reconnect_time``: exit code 3 with slave, t, H and cause, and results are kept."""
     where = f"tcp/{hosts.addresses['slave']}:7447"
@@ -149,6 +151,7 @@ def test_a_cable_that_stays_cut_ends_the_run(start: Commands, hosts: Hosts, tmp_
 
 
 @pytest.mark.parametrize("chassis", ["by hand", "launched"])
+@pytest.mark.slow
 def test_a_router_between_all_and_its_restart(
     chassis: str, start: Commands, tmp_path: Path, endpoint: str
 ) -> None:
@@ -188,6 +191,7 @@ def test_a_router_between_all_and_its_restart(
     assert "ending: SIGTERM" in second.text
 
 
+@pytest.mark.slow
 def test_a_cut_behind_a_router(start: Commands, hosts: Hosts, tmp_path: Path) -> None:
     """Master, router and slave on three hosts; the slave's cable is cut for 2 s in mid step.
 
@@ -273,6 +277,7 @@ def test_no_router(start: Commands, tmp_path: Path, endpoint: str) -> None:
 # ---- The document -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_deployment_document_works(
     start: Commands, hosts: Hosts, fmu_dir: Path, tmp_path: Path
 ) -> None:

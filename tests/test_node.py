@@ -622,6 +622,7 @@ def test_abort_ends_an_endless_step(
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere it cannot be told")
 @pytest.mark.parametrize("end", ["crash", "stop"])
+@pytest.mark.slow
 def test_what_a_model_has_started_ends_with_it(end: str, tmp_path: Path) -> None:
     """A program beside the model holds the worker's end of the pipe: the crash is seen all the
     same, with its signal, and the program does not outlive the worker.

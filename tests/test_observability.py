@@ -144,6 +144,7 @@ def test_master_and_slave_log_json(start: Start, tmp_path: Path, endpoint: str) 
 
 
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
+@pytest.mark.slow
 def test_agent_and_router_log_json(start: Start, tmp_path: Path, endpoint: str) -> None:
     """From their first line to their last."""
     servers = [
@@ -504,6 +505,7 @@ def test_the_progress_names_the_slowest_slave_and_its_share(
 
 
 @pytest.mark.skipif(os.name != "posix", reason="uses processes")
+@pytest.mark.slow
 def test_a_slow_slave_is_named_at_the_end_of_a_run(start: Start, tmp_path: Path) -> None:
     """It takes nearly all of the time; nothing times out but what the user said."""
     models = Path(__file__).parent / "quarter_car_models.py"

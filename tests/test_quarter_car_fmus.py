@@ -207,6 +207,7 @@ def test_declared_feed_through(descriptions: dict[str, Any], model: str) -> None
     assert fed_through == ({("F", "x_c"), ("F", "v_c")} if model == "wheel_force" else set())
 
 
+@pytest.mark.slow
 def test_build_is_reproducible(
     build_script: ModuleType, fmu_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -120,6 +120,7 @@ def test_killed_slaves_come_back(
         assert re.search(r"; started again and restored in \d+\.\d s: the run goes on$", text)
 
 
+@pytest.mark.slow
 def test_killed_holders_come_back(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A model in a process that forks is killed in mid step: no rejected step, the same files."""
     simulation = FEW_STEPS + 'estimator = "mod"\n'
@@ -391,6 +392,7 @@ def test_a_model_that_crashes_always(tmp_path: Path) -> None:
     assert (info.value.exit_code, info.value.slave) == (4, "chassis")
 
 
+@pytest.mark.slow
 def test_a_model_that_hangs_always(tmp_path: Path) -> None:
     """Repeated once as it was and once smaller, then exit code 5; no process is left."""
     simulation = SMALL_STEPS + "smallest_step_size = 5e-4\n"

@@ -88,6 +88,7 @@ def test_a_slave_stopped_for_a_second_changes_nothing(
         ("worker", "step_timeout = 1.0\n", 5, r"no reply within 1 s"),
     ],
 )
+@pytest.mark.slow
 def test_a_slave_stopped_for_ever_ends_the_run(  # noqa: PLR0917
     victim: str,
     bus: str,

@@ -407,6 +407,7 @@ def test_examined_fmus_give_the_same_bytes(fmu_dir: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.usefixtures("no_process_left")
+@pytest.mark.slow
 def test_slaves_over_the_bus_are_examined_too(
     capability_dir: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -77,6 +77,7 @@ def test_a_type_that_is_not_defined_is_left_out() -> None:
     assert repair(within) == repair(itself) == repair(known) == []
 
 
+@pytest.mark.slow
 def test_an_fmu_with_slips_runs_as_one_without(
     fmu_dir: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

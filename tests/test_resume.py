@@ -265,6 +265,7 @@ def assert_complete(out: Path, whole: Path) -> None:
     assert Result.load(out).summary["outcome"] == "completed"
 
 
+@pytest.mark.slow
 def test_a_master_that_is_killed_at_its_very_end(tmp_path: Path) -> None:
     """Results are complete before the checkpoint goes; resume only removes it then."""
     out = broken_off(tmp_path)
@@ -277,6 +278,7 @@ def test_a_master_that_is_killed_at_its_very_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("interval", [60.0, 0.05])
+@pytest.mark.slow
 def test_a_disk_that_is_full_for_the_last_rows(interval: float, tmp_path: Path) -> None:
     """The run has failed, and its rows are whole; with room it goes on to the same bytes."""
     settings = f"stop_time = 2.0\nlargest_step_size = 1e-3\ncheckpoint_interval = {interval}\n"
@@ -357,6 +359,7 @@ def test_a_master_that_is_killed(
 
 
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
+@pytest.mark.slow
 def test_fmus_and_a_ctrl_c_in_mid_run(start: Start, tmp_path: Path, fmu_dir: Path) -> None:
     """Serialised states of FMUs lead a resumed run to the bits of one that was not broken off."""
     settings = "stop_time = 4.0\nlargest_step_size = 1e-3\n"

@@ -70,6 +70,7 @@ def test_what_a_killed_process_leaves_is_removed_by_the_next(
     assert list(place.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_what_is_not_ours_stays(place: Path, tmp_path: Path) -> None:
     """Other names, files, links with what is behind them, and directories of other users."""
     outside = tmp_path / "outside"

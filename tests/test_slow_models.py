@@ -122,6 +122,7 @@ def test_an_fmu_that_refuses_a_choice_of_its_log_runs_all_the_same(
         ("fmi2DoStep", "step_timeout", 2.0),
     ],
 )
+@pytest.mark.slow
 def test_an_endless_call_ends_with_the_key_of_its_bound(  # noqa: PLR0917
     function: str,
     key: str,
@@ -159,6 +160,7 @@ def test_loading_and_initialization_may_take_longer_than_a_step(
     assert simulate(load_system(file)).summary["outcome"] == "completed"
 
 
+@pytest.mark.slow
 def test_a_served_slave_whose_reset_hangs_is_loaded_anew(
     start: Start, tmp_path: Path, capability_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -199,6 +199,7 @@ def test_without_states_nothing_is_taken_back() -> None:
     assert set(summary["rollbacks"].values()) == {0}
 
 
+@pytest.mark.slow
 def test_the_command_line_chooses_for_all_slaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -210,6 +210,7 @@ def test_every_fault_is_named() -> None:
 # ---- The commands -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_list_and_doctor_through_a_router(start: Commands, tmp_path: Path, endpoint: str) -> None:
     """A free slave, one that is held, who holds it, and the router, as data and as tables."""
     through = ("--connect", endpoint, "--mode", "client")
