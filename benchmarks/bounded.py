@@ -49,13 +49,16 @@ class Outcome:
     left: tuple[str, ...]
 
 
-def adopt_orphans() -> None:
+def adopt_orphans(adopts: int = 1) -> None:
     """Make processes whose parents die children of this process, so that none is overlooked.
 
     Only Linux can do that.
+
+    Args:
+        adopts: 0: no longer.
     """
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, adopts, 0, 0, 0)
 
 
 def run_bounded(

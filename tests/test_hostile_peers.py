@@ -89,6 +89,7 @@ def check_flooded(out: Path, heard: Heard, tmp_path: Path) -> None:
     assert contents(out) == contents(whole / "out")
 
 
+@pytest.mark.slow
 def test_hostile_requests_during_a_run_change_no_bit(start: Commands, tmp_path: Path) -> None:
     """Law: thousands of malformed, forged, replayed and guessed requests: the same files."""
     out, heard = flooded_run(start, tmp_path, LONG, REQUESTS, 1)
@@ -109,6 +110,7 @@ def test_a_hundred_thousand_hostile_requests_change_no_bit(start: Commands, tmp_
         sent += heard.sent
 
 
+@pytest.mark.slow
 def test_many_masters_on_one_bus(start: Commands, tmp_path: Path, endpoint: str) -> None:
     """Four runs of one system at once through one router, each with slaves of its own."""
     router = start("slave_node", "router", "--listen", endpoint)

@@ -693,6 +693,7 @@ def test_ctrl_c_ends_a_sweep_at_once_and_it_can_go_on(
 
 
 @pytest.mark.usefixtures("no_process_left")
+@pytest.mark.slow
 def test_runs_do_not_outlive_a_sweep_that_was_killed(
     start: Callable[..., Command], tmp_path: Path
 ) -> None:
@@ -828,6 +829,7 @@ def test_ctrl_c_ends_the_runs_on_a_cluster(
 
 
 @pytest.mark.usefixtures("no_process_left")
+@pytest.mark.slow
 def test_what_a_cluster_lacks_is_said(cluster: Any, tmp_path: Path) -> None:
     """No scheduler, no licence on any worker, and workers that are asked for beside a cluster."""
     car(tmp_path)
