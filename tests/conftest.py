@@ -56,7 +56,7 @@ def _signals_as_in_a_login_shell() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True, scope="module")
+@pytest.fixture(autouse=True)
 def _no_orphans_are_adopted() -> Iterator[None]:
     """Benchmarks adopt orphans: those of later tests are not to stay as zombies of this process."""
     yield
