@@ -6,8 +6,8 @@ import ctypes
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -49,16 +49,21 @@ class Outcome:
     left: tuple[str, ...]
 
 
-def adopt_orphans(adopts: int = 1) -> None:
-    """Make processes whose parents die children of this process, so that none is overlooked.
+@contextmanager
+def _orphans_adopted() -> Iterator[None]:
+    """Make processes whose parents die children of this one, so that none is overlooked.
 
     Only Linux can do that.
-
-    Args:
-        adopts: 0: no longer.
     """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, adopts, 0, 0, 0)
+    if sys.platform != "linux":
+        yield
+        return
+    prctl = ctypes.CDLL(None).prctl
+    prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    try:
+        yield
+    finally:
+        prctl(_PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
 
 
 def run_bounded(
@@ -77,7 +82,7 @@ def run_bounded(
         seconds: it is killed after that time [s].
         memory_bytes: it is killed where it and its children hold more [B].
     """
-    with TemporaryFile() as stdout, TemporaryFile() as stderr:
+    with _orphans_adopted(), TemporaryFile() as stdout, TemporaryFile() as stderr:
         begin = monotonic()
         process = subprocess.Popen(
             command,

@@ -372,7 +372,7 @@ class Controller(Model):
         return [self.wanted - u[0]]
 
     def output_values(self, t: float, x: Any, u: Any) -> list[float]:
-        """What is asked of the plant."""
+        """Set point of the plant."""
         return [self.K * (self.wanted - u[0] + x[0] / self.T)]
 
     def output_derivatives(self, t: float, x: Any, u: Any, dx: Any, du: Any) -> list[float]:

@@ -45,7 +45,7 @@ _ELSEWHERE = {
 
 
 def __getattr__(name: str) -> object:
-    """What is public, imported when it is asked for: commands need but a part of it."""
+    """Import public names when they are asked for: commands need but a part of them."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_ELSEWHERE.get(name, 'configuration')}"), name)

@@ -39,7 +39,7 @@ class AvailablePolynomials:
         return points if self._coupling is None else min(points, self._coupling.points(history))
 
     def of(self, polynomial: InputPolynomial, history: CouplingHistory) -> Polynomials:
-        """What ``polynomial`` becomes for each kind of input, in a step from the newest point."""
+        """Polynomials nearest to ``polynomial``, for each kind of input, from the newest point."""
         points, known = self.points(history), self._extrapolation.known
         polynomials = self._extrapolation.polynomials(polynomial, points)
         polynomials = known(polynomials, history, points)
@@ -50,7 +50,7 @@ class AvailablePolynomials:
         return polynomials
 
     def allow(self, polynomial: InputPolynomial, history: CouplingHistory) -> bool:
-        """Whether all inputs can have its degree, but for those whose slaves never can."""
+        """True if all inputs can have its degree, but for those whose slaves never can."""
         return all(
             got.order == min(polynomial.order, kind.max_order)
             for got, kind in zip(

@@ -118,7 +118,7 @@ def _not_iterated(coupled: CoupledSystem, system: System) -> list[str]:
 
 
 def _local_sources(part: SlavePart) -> list[str]:
-    """What feeds inputs and is not meant for other models."""
+    """Warnings of sources of inputs that are not meant for other models."""
     locals_ = [
         name for name in part.locals if part.description.variable(name).causality is Causality.LOCAL
     ]
@@ -269,7 +269,7 @@ class CoSimulation:
         return statistics
 
     def _start(self, outputs: Outputs) -> RunStart:
-        """What observers are told first."""
+        """Beginning of the run, as observers are told of it."""
         coupled, settings = self.coupled, self.system.simulation
         discrete, recorded = coupled.discrete, coupled.recorded
         y, d = recorded.split(outputs.y, outputs.d)

@@ -94,7 +94,7 @@ def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 MappingEntries = Mapping[bool, bool] | Mapping[int | str, int | str]
-"""What becomes of values: booleans, or integers and items of enumerations."""
+"""Values and what becomes of them: booleans, or integers and items of enumerations."""
 
 _BOOLEAN_KEYS = {"true": True, "false": False}
 

@@ -23,7 +23,7 @@ from protocol.values import type_in_words
 log = logging.getLogger("master_node")
 
 _SOURCES = (Causality.OUTPUT, Causality.LOCAL, Causality.CALCULATED_PARAMETER)
-"""What can feed an input: all that a model computes."""
+"""Causalities of variables that can feed an input: all that a model computes."""
 
 Descriptions = Mapping[str, SlaveDescription]
 
@@ -273,7 +273,7 @@ def _check_causality(
 def read_variables(
     descriptions: Descriptions, connections: Sequence[ScalarConnection]
 ) -> dict[str, tuple[Variable, ...]]:
-    """What is read of each slave at communication points: outputs, and other sources.
+    """Variables of each slave that are read at communication points: outputs, and other sources.
 
     In the order of its variables; clocks carry no value.
     """

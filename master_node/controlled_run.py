@@ -370,7 +370,7 @@ class ControlledRun:
         return position, polynomials, step
 
     def _tell_lost_events(self, doubtful: FailedStep) -> None:
-        """The same step from the same state has ended otherwise; said once for each slave."""
+        """Warn once of each slave whose step from the same state has ended otherwise."""
         if doubtful.slave in self._loses_events:
             return
         self._loses_events.add(doubtful.slave)
@@ -682,7 +682,7 @@ class ControlledRun:
         )
 
     def _begins_from_rest(self, position: Position) -> bool:
-        """Whether the past is made up, so that no defect tells a jump from the first motion."""
+        """True if the past is made up, so that no defect tells a jump from the first motion."""
         times = position.history.times
         return len(times) > 1 and times[1] < self._start
 

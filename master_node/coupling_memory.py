@@ -8,7 +8,6 @@ Near 1 its estimate is blind, and beyond it is unstable (docs/numerics.md).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +35,7 @@ _PATIENCE = 3
 """Explicit double steps in a row with a large loop gain before iterated ones are tried."""
 
 _LASTING_PATIENCE = 8
-"""As many times more of them with a lasting one before that."""
+"""Factor of that patience where the loop gain is a lasting one."""
 
 _RELIEF = 3
 """Double steps with a lasting gain that one with a smaller one makes good."""
@@ -55,17 +54,17 @@ _EXPLICIT_DO_STEPS = 3
 """That an explicit double step costs."""
 
 _WORTH = 1.5
-"""How much further iterated double steps have to lead: they cost trials, too."""
+"""Factor by which iterated double steps have to lead further: they cost trials, too."""
 
 _MOST_PATIENCE = 24
-"""Of them at most: as often as iterated ones were not worth it, it is doubled."""
+"""Largest patience: it is doubled each time that iterated double steps were not worth it."""
 
 _SMALLEST_DIFFERENCE = 1e-5
 """Difference of the inputs, in units of their tolerances, below which outputs tell nothing."""
 
 
 class CouplingMemory(NamedTuple):
-    """What a run remembers of its coupling.
+    """Memory of a run for the choice between explicit and iterated double steps.
 
     Attributes:
         is_implicit: whether double steps are iterated.
@@ -103,7 +102,7 @@ class CouplingMemory(NamedTuple):
 
     @property
     def asks_for_iteration(self) -> bool:
-        """Whether iterated double steps are to be tried."""
+        """True if iterated double steps are to be tried."""
         is_stiff = self.in_a_row >= self.patience
         is_lasting = self.lasting >= _LASTING_PATIENCE * self.patience
         return not self.is_implicit and (is_stiff or is_lasting)
@@ -149,18 +148,18 @@ class CouplingMemory(NamedTuple):
 def explicit_jacobian(
     interface: Interface, inputs: FloatArray, outputs: FloatArray, scale: FloatArray
 ) -> InterfaceJacobian:
-    """What the two solutions of an explicit double step tell of the interface Jacobian.
+    """Interface Jacobian as far as the two solutions of an explicit double step tell it.
 
     Each slave has answered to two inputs from the same state: one secant, that of the direction in
     which the extrapolation errs.
 
     Args:
         interface: which inputs and outputs belong to which slave.
-        inputs: difference of the inputs at the end, shape (n,), unit [u].
-        outputs: difference of the outputs there, shape (m,), unit [y].
+        inputs: mean difference of the inputs in the step, shape (n,), unit [u].
+        outputs: difference of the outputs at its end, shape (m,), unit [y].
         scale: tolerances of the inputs, shape (n,), unit [u].
     """
-    secants: Sequence[Secants] = [
+    secants = [
         Secants((inputs[columns],), (outputs[rows],))
         if np.abs(inputs[columns] / scale[columns]).max(initial=0.0) > _SMALLEST_DIFFERENCE
         else Secants()

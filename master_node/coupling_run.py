@@ -7,8 +7,10 @@ take over, until the gain is small again (`coupling_memory.py`).
 
 from __future__ import annotations
 
+import numpy as np
+
 from master_node.controlled_run import ControlledRun, Position
-from master_node.coupling_memory import BLIND, CouplingMemory, explicit_jacobian
+from master_node.coupling_memory import BLIND, LASTING, CouplingMemory, explicit_jacobian
 from master_node.double_step import DoubleStep
 from master_node.error_control import StepError
 from master_node.iterated_error_control import IteratedErrorControl
@@ -18,11 +20,15 @@ from master_node.numerics.discontinuities import Defects
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import ErrorEstimator
 from master_node.numerics.extrapolation import CouplingHistory, Polynomials
+from master_node.numerics.interface_jacobian import loop_gain_bound
 from master_node.numerics.order_control import OrderMemory
 from master_node.numerics.step_size_controller import NOTHING, ControllerMemory
 from master_node.outputs import Outputs
 from master_node.run_context import RunContext
 from master_node.step_requests import FailedStep
+
+_WHOLE = 0.99
+"""Part of the H that was wanted, below which something cut a double step short."""
 
 _KEPT = 1.2
 """Growth of H up to which it stays as it is: the secants of a step of the same size fit."""
@@ -51,6 +57,9 @@ class CouplingRun(ControlledRun):
         coupled = context.coupled
         self._method = coupling
         self._interface = interface_of(coupled)
+        self._slave_of_source = coupled.output_slave[coupled.source]
+        counts = [len(part.connected) for part in coupled.parts]
+        self._slave_of_input = np.repeat(np.arange(len(counts)), counts)
         self._implicit = IteratedStepper(self._stepper.requests, coupled, context.scheme)
         self._iterated = IteratedErrorControl(coupled)
 
@@ -80,12 +89,13 @@ class CouplingRun(ControlledRun):
         if step.iteration is not None:
             return self._iterated.judge(step)
         error = super()._judge(step)
-        jacobian = explicit_jacobian(
-            self._interface,
-            step.input_difference,
-            step.comparison - step.end[0],
-            self._coupled.scale_of_inputs(error.scale),
-        )
+        inputs, outputs = step.input_difference, step.comparison - step.end[0]
+        scale = self._coupled.scale_of_inputs(error.scale)
+        answers = self._coupled.changes_of_inputs(outputs) / scale
+        slaves = self._slave_of_input, self._slave_of_source
+        if loop_gain_bound(inputs / scale, answers, *slaves) < LASTING:
+            return error
+        jacobian = explicit_jacobian(self._interface, inputs, outputs, scale)
         gain = jacobian.loop_gain
         if gain < BLIND:
             return error._replace(loop_gain=gain)
@@ -151,7 +161,7 @@ class CouplingRun(ControlledRun):
         if iteration.number >= _SLOW:
             factor = min(factor, _SHORTER)
         following = step.times.step_size * factor
-        if step.times.step_size < 0.99 * position.step_size:  # cut short
+        if step.times.step_size < _WHOLE * position.step_size:
             following = max(following, position.step_size)
         return self._controller.bounded(following), self._restarted_order(), NOTHING
 

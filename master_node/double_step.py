@@ -52,7 +52,7 @@ from protocol.signals import FloatArray, InputSignal
 
 
 class Iteration(NamedTuple):
-    """How the inputs of an iterated double step were found.
+    """Iteration by which the inputs of a double step were found.
 
     Attributes:
         collocation: their polynomial.
@@ -102,7 +102,7 @@ class DoubleStep(NamedTuple):
 
     @property
     def iterations(self) -> int:
-        """How many it took to find the inputs; 0: they were extrapolated."""
+        """Number of evaluations that it took to find the inputs; 0: they were extrapolated."""
         return 0 if self.iteration is None else self.iteration.number
 
 
@@ -252,12 +252,13 @@ class DoubleStepper:
             (at_end,) = self._carefully(self._careful_second_request, second_piece)
         else:
             (at_end,) = self.requests.take(self._second_request, (second_piece,))
-        mean_second = InputSignal(in_second.begin).mean(second)
         if self._is_long_step:
-            mean_first = InputSignal(in_first.begin).mean(first)
-            difference = InputSignal(in_long.begin).mean(size) - 0.5 * (mean_first + mean_second)
+            small = InputSignal(in_first.begin).mean(first) + InputSignal(in_second.begin).mean(
+                second
+            )
+            difference = InputSignal(in_long.begin).mean(size) - 0.5 * small
         else:
-            difference = InputSignal(in_first.end).mean(second) - mean_second
+            difference = InputSignal(in_first.end - in_second.begin).mean(second)
         return DoubleStep(
             times,
             polynomials,

@@ -43,7 +43,7 @@ class StepError(NamedTuple):
         norm: ERR of equation (8); inf when a value is not finite.
         limiting_variable: ``slave.variable`` with the largest part in ERR.
         loop_gain: spectral radius of the interface Jacobian as far as the double step tells it; 0
-            where it is not looked at.
+            where it is not looked at, or too small to matter.
     """
 
     difference: FloatArray

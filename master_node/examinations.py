@@ -50,10 +50,10 @@ _GOLDEN = 0.6180339887498949
 may be a difference."""
 
 _STEP_SIZE = 1e-2
-"""Of the trial steps, where neither the user nor the model says anything [s]."""
+"""Size of the trial steps, where neither the user nor the model says anything [s]."""
 
 _SHARE = 32.0
-"""Of the simulated time: one part in so many is the longest trial step."""
+"""Parts of the simulated time, of which the longest trial step is one."""
 
 _BEFORE = 0
 """The number under which the state is saved meanwhile."""
@@ -223,7 +223,7 @@ def remedy(
     configuration: Configure,
     system: System,
 ) -> Remedy:
-    """What to do about a slave: the first thing that is to be settled before others, or all others.
+    """Remedies for a slave: the first one that is to be settled before others, or all others.
 
     Args:
         name: of the slave.

@@ -107,7 +107,7 @@ def resolve_external(
 
 
 def can_be_driven(variable: Variable) -> bool:
-    """Whether a variable can be given values while a run goes on."""
+    """True if a variable can be given values while a run goes on."""
     is_tunable = variable.causality is Causality.PARAMETER and variable.variability == "tunable"
     return variable.causality is Causality.INPUT or is_tunable
 

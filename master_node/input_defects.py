@@ -38,6 +38,8 @@ class InputDefects:
             scheme.extrapolation.kind_of_input
         ]
         self._is_direct = scheme.feed_through.take(coupled.source)
+        self._has_direct = bool(self._is_direct.any())
+        self._none = np.zeros(len(coupled.source))
         self._slave_behind = coupled.output_slave.take(coupled.source)
         self.number = len(coupled.source)
 
@@ -98,15 +100,15 @@ class InputDefects:
 
     def of_accepted(self, step: DoubleStep, defects: Defects, error: StepError) -> SmoothStep:
         """The defects to come, as an accepted double step lets expect them."""
-        weighted = np.abs(error.estimate).take(self._coupled.source)
-        weighted *= np.abs(self._coupled.factor)
-        echoes = weighted / self._coupled.scale_of_inputs(error.scale)
-        return SmoothStep(
-            step.times.first,
-            defects.largest,
-            np.where(self._is_direct, echoes, 0.0),
-            np.where(self._is_ahead, 0.0, defects.end),
-        )
+        echoes, corrections = self._none, defects.end
+        if self._has_direct:
+            weighted = np.abs(error.estimate).take(self._coupled.source)
+            weighted *= np.abs(self._coupled.factor)
+            weighted /= self._coupled.scale_of_inputs(error.scale)
+            echoes = np.where(self._is_direct, weighted, 0.0)
+        if self._known_ahead:
+            corrections = np.where(self._is_ahead, 0.0, corrections)
+        return SmoothStep(step.times.first, defects.largest, echoes, corrections)
 
     def are_answers(self, defects: Defects, jumping: Inputs, smooth: SmoothStep | None) -> bool:
         """Tell whether inputs that jump at T_n are outputs that answer there to other inputs.

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 
 def matches(name: str, pattern: str) -> bool:
-    """Whether a pattern without ``!`` means a name."""
+    """True if a pattern without ``!`` means a name."""
     return fnmatchcase(name, pattern.replace("[", "[[]"))
 
 
 def is_name(pattern: str) -> bool:
-    """Whether a pattern means one name alone."""
+    """True if a pattern means one name alone."""
     return not pattern.startswith("!") and "*" not in pattern and "?" not in pattern
 
 

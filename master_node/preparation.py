@@ -155,7 +155,7 @@ class _Preparation:
             self._begin_anew()
 
     def _goes_on_without_derivatives(self, error: SlaveError, scheme: CouplingScheme) -> bool:
-        """Whether a slave refused its output derivatives, without which all begins anew."""
+        """True if a slave refused its output derivatives, without which all begins anew."""
         reads = dict(zip(self._group.names, scheme.get_outputs, strict=True))
         if error.phase != GetOutputs.verb or not reads[error.slave].order:
             return False
@@ -214,7 +214,7 @@ class _Preparation:
     def _examined(
         self, names: set[str], outputs: Outputs
     ) -> tuple[dict[str, Examination], dict[str, Configure]]:
-        """What these slaves showed, and the configurations that it calls for, where they change."""
+        """Findings about these slaves, and the configurations that change by them."""
         prepared = self._prepared
         system, descriptions = prepared.system, prepared.descriptions
         configurations = prepared.configurations

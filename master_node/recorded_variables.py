@@ -84,12 +84,12 @@ class RecordedVariables:
 
     @cached_property
     def is_empty(self) -> bool:
-        """Whether there are none."""
+        """True if there are none."""
         return not any(self.names)
 
     @staticmethod
     def values(read: RecordedValues) -> Values:
-        """What a slave gave, in the order of its names."""
+        """Values of a slave, in the order of its names."""
         return (*read.numbers[0].tolist(), *read.others)
 
     def replaced(self, d: Values, read: Mapping[int, RecordedValues]) -> Values:
@@ -107,7 +107,7 @@ class RecordedVariables:
         return tuple(values)
 
     def split(self, y: FloatArray, d: Values) -> tuple[FloatArray, Values]:
-        """What results hold of a point.
+        """Values of a point that results hold.
 
         Args:
             y: outputs, shape (rows, m).

@@ -1,4 +1,4 @@
-"""How long a request may take, by what it has the slave do."""
+"""Bounds on the time of requests, by what they have the slave do."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RequestBounds:
 
     @staticmethod
     def of(system: System) -> RequestBounds:
-        """As the system says."""
+        """Bounds of a system, from its ``[bus]`` table."""
         bus = system.bus
         return RequestBounds(
             float(bus.load_timeout), float(bus.initialization_timeout), float(bus.step_timeout)

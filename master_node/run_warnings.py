@@ -15,7 +15,7 @@ _SHARE_OF_JUMPS, _SHARE_OF_FALSE_ALARMS = 0.5, 0.1
 
 
 _SHARE_OF_STIFF_STEPS = 0.05
-"""Of all double steps that may be explicit where the coupling is stiff."""
+"""Share of all double steps that may be explicit where the coupling is stiff."""
 
 
 def warnings_of(statistics: Statistics) -> list[str]:

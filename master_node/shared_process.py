@@ -27,10 +27,15 @@ import signal
 import sys
 import threading
 import warnings
+
+# As in `signal`, but for the conversion of numbers to enumerations, which takes ten times as long.
+from _signal import getsignal  # type: ignore[import-not-found]
+from _signal import signal as set_handler
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, ParamSpec, TypeVar
 
+from protocol.descriptors import is_open
 from protocol.user_code import user_context
 
 P = ParamSpec("P")
@@ -38,7 +43,7 @@ T = TypeVar("T")
 
 
 class SharedProcess:
-    """What one model changes of the process, and finds again.
+    """State of the process that one model changes, and finds again.
 
     Args:
         baseline: to which the process returns.
@@ -51,7 +56,7 @@ class SharedProcess:
 
     def step(self, action: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
         """Let the model take a step."""
-        handlers = [(number, signal.getsignal(number)) for number in _ENDING]
+        handlers = [(number, getsignal(number)) for number in _ENDING]
         if self._directory is not None:
             _go_to(self._directory)
         try:
@@ -85,7 +90,7 @@ class Baseline:
         self.directory = _directory()
         self._umask = _umask()
         self._streams = sys.stdin, sys.stdout, sys.stderr
-        self._descriptors = [(number, os.dup(number)) for number in range(3) if _is_open(number)]
+        self._descriptors = [(number, os.dup(number)) for number in range(3) if is_open(number)]
         self._locale = locale.setlocale(locale.LC_ALL)
         self._logging = logging.root.manager.disable, list(logging.root.handlers)
 
@@ -96,7 +101,7 @@ class Baseline:
         sys.stdin, sys.stdout, sys.stderr = self._streams
         for number, kept in self._descriptors:
             with suppress(OSError):
-                if not (_is_open(number) and os.path.sameopenfile(number, kept)):
+                if not (is_open(number) and os.path.sameopenfile(number, kept)):
                     os.dup2(kept, number)
         if locale.setlocale(locale.LC_ALL) != self._locale:
             with suppress(locale.Error):
@@ -136,7 +141,7 @@ class _Signals:
     """The handlers of signals, those of Python and those behind them."""
 
     def __init__(self) -> None:
-        self._handlers = {number: signal.getsignal(number) for number in signal.valid_signals()}
+        self._handlers = {number: getsignal(number) for number in signal.valid_signals()}
         self._actions = {number: _sigaction(number) for number in self._handlers}
 
     def restore(self) -> None:
@@ -144,7 +149,7 @@ class _Signals:
         _handle(
             (number, handler)
             for number, handler in self._handlers.items()
-            if signal.getsignal(number) is not handler
+            if getsignal(number) is not handler
         )
         for number, action in self._actions.items():
             if action is not None and _sigaction(number) != action:
@@ -159,7 +164,7 @@ def _handle(handlers: Iterable[tuple[int, Any]]) -> None:
     if threading.current_thread() is threading.main_thread():
         for number, handler in handlers:
             if handler is not None:
-                signal.signal(number, handler)
+                set_handler(number, handler)
 
 
 _SIGACTION = 256
@@ -167,7 +172,7 @@ _SIGACTION = 256
 
 
 def _sigaction(number: int, action: bytes | None = None) -> bytes | None:
-    """What the process does at a signal, after setting it; None: not to be known."""
+    """Action of the process at a signal, as it was before it is set; None: not to be known."""
     function: Any = getattr(_LIBC, "sigaction", None)
     if function is None:
         return None
@@ -196,11 +201,3 @@ def _umask() -> int:
     mask = os.umask(0o077)
     os.umask(mask)
     return mask
-
-
-def _is_open(descriptor: int) -> bool:
-    try:
-        os.fstat(descriptor)
-    except OSError:
-        return False
-    return True

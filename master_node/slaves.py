@@ -22,7 +22,7 @@ from master_node.presence import Presence
 from master_node.remote_slave import RemoteSlave
 from master_node.request_bounds import RequestBounds
 from master_node.restarts import Restarts
-from master_node.shared_process import Baseline, SharedProcess
+from master_node.shared_process import Baseline, SharedProcess, shared_process
 from master_node.slave_link import LocalSlave, SlaveLink
 from protocol.bus import DEFAULT_ENDPOINT, Bus
 from protocol.calls import Describe
@@ -78,18 +78,20 @@ class Slaves:
 
 
 @contextmanager
-def slaves_in_process(system: System, baseline: Baseline) -> Iterator[Slaves]:
+def slaves_in_process(system: System, baseline: Baseline | None = None) -> Iterator[Slaves]:
     """All slaves in this process, without a bus.
 
     Args:
         system: what to run.
-        baseline: to which the process returns from what models do to it.
+        baseline: to which the process returns from what models do to it; None: as it is now.
 
     Raises:
         ConfigurationError: a slave has no model, or its model cannot be loaded.
     """
     load = entry_points(group="doublestep.in_process")["slave"].load()
     with ExitStack() as stack:
+        if baseline is None:
+            baseline = stack.enter_context(shared_process())
         links: dict[str, SlaveLink] = {}
         descriptions = {}
         for name, settings in system.slaves.items():

@@ -75,7 +75,7 @@ class FailedStep:
 
     @property
     def has_doubtful_event(self) -> bool:
-        """Whether the slave returned early in a step that it may complete when it is repeated."""
+        """True if the slave returned early in a step that it may complete when it is repeated."""
         return self.status is StepStatus.EARLY_RETURN and self.follows_restore
 
     @property

@@ -88,7 +88,7 @@ class SlavePart:
 
     @property
     def max_output_derivative_order(self) -> int:
-        """Of all its outputs: only what a model declares as an output has derivatives in FMI."""
+        """Highest order of derivatives of all its outputs; 0 with locals: FMI has none for them."""
         return 0 if self.locals else self.description.capabilities.max_output_derivative_order
 
     @property

@@ -79,7 +79,7 @@ def read_text_table(path: Path) -> TextTable:
 
 
 def is_number(text: str) -> bool:
-    """Whether a text is a number with a decimal point, as Python reads it."""
+    """True if a text is a number with a decimal point, as Python reads it."""
     try:
         float(text)
     except ValueError:
@@ -108,7 +108,7 @@ def _lines(text: str) -> tuple[str | None, list[str]]:
 
 
 def _separator(header: str, lines: Sequence[str]) -> str:
-    """What stands between the columns; " " for any number of spaces."""
+    """Separator of the columns; " " for any number of spaces."""
     first = next(iter(lines), header)
     counts = [[_QUOTED.sub("", line).count(s) for line in (header, first)] for s in _SEPARATORS]
     for separator, (in_header, in_first) in zip(_SEPARATORS, counts, strict=True):
@@ -126,7 +126,7 @@ def _split(lines: Sequence[str], separator: str) -> list[list[str]]:
 
 
 def _is_any_number(text: str) -> bool:
-    """Whether a text is a number with a decimal point or a decimal comma."""
+    """True if a text is a number with a decimal point or a decimal comma."""
     return is_number(text) or _COMMA_NUMBER.fullmatch(text.strip()) is not None
 
 

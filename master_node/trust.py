@@ -1,4 +1,4 @@
-"""Whose word is taken for what is run.
+"""Trust in what a directory or package of others says is to be run.
 
 A checkpoint names models and functions, which resuming runs as the user. So it must be the user's
 own, or the user must say that it is trusted.

@@ -46,9 +46,9 @@ class UnansweredInputs:
 
     def of(self, defects: Defects, error: StepError) -> Inputs | None:
         """The inputs off by more than a tolerance of which ERR tells nothing, (n,); None: none."""
-        largest = defects.largest
-        if not (largest > 1.0).any():
+        if defects.are_within_tolerance:
             return None
+        largest = defects.largest
         estimate = np.abs(error.estimate) / error.scale
         found = np.zeros(len(largest), dtype=bool)
         for part in self._coupled.parts:

@@ -20,7 +20,7 @@ DEFAULT_ORPHAN_TIME: Final = 15.0
 """How long a slave waits for a master that does not say how long [s]."""
 
 DEFAULT_LOAD_TIMEOUT: Final = 120.0
-"""How long a model may take to be loaded, unless it is said otherwise [s]."""
+"""Bound on the loading of a model, unless it is said otherwise [s]."""
 
 STATUS_BYTES: Final = 4 * 2**20
 """Length of the largest status that is taken, that of an agent with hundreds of slaves."""
@@ -47,7 +47,7 @@ class Claim:
     secret: str = field(default="", repr=False)
 
     def to_message(self) -> dict[str, StartValue | None]:
-        """As plain data."""
+        """Plain data of this value."""
         return {
             "run": self.run,
             "host": self.host,
@@ -94,7 +94,7 @@ class Claimed:
 
     @classmethod
     def from_message(cls, message: Mapping[str, StartValue]) -> Self:
-        """What ``to_message`` wrote.
+        """Value that ``to_message`` wrote.
 
         Raises:
             MalformedMessageError: a value is missing or has another type.

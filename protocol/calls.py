@@ -307,7 +307,7 @@ class StepResult(NamedTuple):
 
 
 class RecordedValues(NamedTuple):
-    """What variables have that are read for results only.
+    """Values of variables that are read for results only.
 
     Attributes:
         numbers: of those with a floating-point type, in order, shape (1, n).

@@ -1,4 +1,4 @@
-"""How a command begins: its modules are imported, which takes longer than much of what it does.
+"""Beginning of a command: its modules are imported, which takes longer than much of what it does.
 
 Until then nothing was begun that would have to be ended, so that Ctrl-C ends the process at once.
 """

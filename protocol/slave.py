@@ -158,7 +158,7 @@ class Variable:
 
     @property
     def has_bounds(self) -> bool:
-        """Whether values are declared that it must not have."""
+        """True if values are declared that it must not have."""
         return bool(self.items) or self.minimum is not None or self.maximum is not None
 
     @property
@@ -289,7 +289,7 @@ class StateVerdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """What trial steps of a slave showed.
+    """Findings of the trial steps of a slave.
 
     Attributes:
         state_verdict: whether its saved states can be trusted.
@@ -326,7 +326,7 @@ class Examination:
 
 
 SUBSTEP_ERROR = 0.1
-"""Of the tolerance: the errors of the substeps of a communication step add up."""
+"""Part of the tolerance for the error of one substep: those of a communication step add up."""
 
 
 class Slave(ABC):

@@ -66,7 +66,7 @@ class BoundsError(ValueError):
 
 
 def checked_value(variable: Variable, given: object, *, ignores_bounds: bool = False) -> StartValue:
-    """The same, within the bounds that the model declares for the variable.
+    """Value of a variable as `value_of` gives it, within the bounds that the model declares.
 
     Raises:
         BoundsError: it is beyond ``min`` or ``max``, or the number of no item, unless

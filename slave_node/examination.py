@@ -54,14 +54,14 @@ def _refused(order: int, refusal: str) -> Examination:
 
 
 def _refusal(error: SlaveError) -> str:
-    """What was said to the inputs; raises an error that is about something else."""
+    """Answer to input derivatives; raises an error that is about something else."""
     if isinstance(error, FatalSlaveError) or error.phase != SetInputs.verb:
         raise error
     return error.cause
 
 
 def _without_rollback(trial: Trial) -> Examination:
-    """Whether inputs are taken; of steps only those that derivatives of outputs call for."""
+    """Trial of inputs; of steps only those that derivatives of outputs call for."""
     call, reason = trial.call, trial.slave.description.state_reason
     try:
         trial.set_inputs(call.input_order)
@@ -117,7 +117,7 @@ def _with_rollback(trial: Trial) -> Examination:
 
 
 def _with_known_inputs(trial: Trial, origin: Place) -> Examination:
-    """The same where input derivatives of all orders are set, and nothing is said to that."""
+    """Trial with input derivatives of all orders, to which nothing is said."""
     call = trial.call
     try:
         states, size = _test_states(trial, origin)
@@ -158,7 +158,7 @@ def _used(place: Place, order: int, refusal: str, size: float) -> tuple[int, str
 
 
 def _test_states(trial: Trial, origin: Place) -> tuple[States, float]:
-    """What saved states are worth, and the size of steps that the slave takes [s].
+    """Worth of saved states, and the size of steps that the slave takes [s].
 
     Raises:
         TrialError: it takes none.
@@ -241,7 +241,7 @@ def _poor_derivatives(trial: Trial, origin: Place, *, repeat: bool) -> dict[str,
 
 
 def _examination(trial: Trial, states: States) -> Examination:
-    """What is known of a slave by its saved states."""
+    """Findings about a slave by its saved states."""
     return Examination(
         states.verdict,
         states.reason,

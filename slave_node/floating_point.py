@@ -17,7 +17,7 @@ _BYTES = 512
 
 
 def _restorer() -> Callable[[], object]:
-    """What brings the present environment back; nothing where there is no C function for it."""
+    """Function that brings the present environment back; without one in C it does nothing."""
     if os.name != "posix":
         return lambda: None
     library = ctypes.CDLL(None)

@@ -16,7 +16,7 @@ def check_parameters(
     *,
     ignores_bounds: bool = False,
 ) -> None:
-    """Whether the model can start with these values.
+    """Check that the model can start with these values.
 
     Raises:
         ConfigurationError: there is no such variable, or it cannot have the value.

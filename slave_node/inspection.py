@@ -118,7 +118,7 @@ def _start(variable: Variable) -> str:
 
 
 def _values(variable: Variable) -> str:
-    """What the model allows: the items of an enumeration with their numbers, or min and max."""
+    """Bounds of the model: the items of an enumeration with their numbers, or min and max."""
     if variable.items:
         return ", ".join(f"{name} = {number}" for name, number in variable.items.items())
     smallest, largest = variable.minimum, variable.maximum

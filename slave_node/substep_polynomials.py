@@ -101,7 +101,7 @@ def _unit(degree: int) -> list[float]:
 def pieces_needed(
     rows: FloatArray, degree: int, nominal: FloatArray, tolerance: float, *, meets_end: bool
 ) -> int:
-    """How many equal pieces an accuracy needs, from 1 to `MAX_SUBSTEPS`.
+    """Number of equal pieces that an accuracy needs, from 1 to `MAX_SUBSTEPS`.
 
     So many that all k + 1 moments can be right. And let r be the relative change of an input in the
     step, and r_2 that part of it which is not along a line; a slave whose f depends on u as a

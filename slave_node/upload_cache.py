@@ -220,7 +220,7 @@ class UploadCache:
             )
 
     def _sent(self) -> int:
-        """What the models need that are being sent [bytes]."""
+        """Room that the models need that are being sent [bytes]."""
         return sum(part.size for part in self._parts.values())
 
     def _drop_given_up(self, now: float) -> bool:

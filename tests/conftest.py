@@ -26,7 +26,6 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
-from benchmarks.bounded import adopt_orphans
 from tests.signal_dispositions import default_dispositions
 from tests.waiting import BOUND, slowdown
 
@@ -54,13 +53,6 @@ def _signals_as_in_a_login_shell() -> Iterator[None]:
     """Commands that tests start can be interrupted, also where the suite itself cannot."""
     with default_dispositions():
         yield
-
-
-@pytest.fixture(autouse=True)
-def _no_orphans_are_adopted() -> Iterator[None]:
-    """Benchmarks adopt orphans: those of later tests are not to stay as zombies of this process."""
-    yield
-    adopt_orphans(0)
 
 
 def _example(folder: str, script: str) -> ModuleType:

@@ -45,7 +45,7 @@ def error_of(result: Result) -> float:
 
 
 class Said:
-    """What the user was told of slave ``a``, but for what every lag is told."""
+    """Warnings about slave ``a``, but for those about every lag."""
 
     def __init__(self, caplog: pytest.LogCaptureFixture) -> None:
         caplog.set_level(logging.WARNING, "master_node")
@@ -69,7 +69,7 @@ def said(caplog: pytest.LogCaptureFixture) -> Said:
 
 
 def derivative_points(result: Result) -> list[int]:
-    """Of the accepted steps, in order."""
+    """Derivative points of the accepted steps, in order."""
     steps = result.steps
     return list(steps["derivative_points"][steps["accepted"]].tolist())
 
@@ -304,7 +304,7 @@ def test_clocks_are_in_the_error_norm_where_they_are_asked_for(
 
 
 def test_a_connected_clock_cannot_be_gone_back_from(capability_dir: Path, said: Said) -> None:
-    """What other slaves depend on has to repeat: no way to save states does that to a clock."""
+    """An output that other slaves depend on has to repeat: no saved state does that to a clock."""
     system = System(
         simulation={"stop_time": 0.1, "initial_step_size": 1e-2, "smallest_step_size": 1e-2},
         slaves={"a": {"model": "clocks.fmu"}, "b": {"model": "plain_lag.fmu"}},
@@ -342,7 +342,7 @@ class Kill:
 @pytest.mark.usefixtures("no_process_left")
 @pytest.mark.slow
 def test_a_slave_with_clocks_is_restored_after_a_kill(capability_dir: Path, tmp_path: Path) -> None:
-    """What does not repeat is not compared when a process takes the place of another one."""
+    """Outputs that do not repeat are not compared when a process takes the place of another."""
     system = lags(capability_dir, "clocks")
     kill = Kill()
     columns = []

@@ -473,5 +473,5 @@ assert not opens_in_a_fork(), "the threads of the bus are those of the other pro
 
 @pytest.mark.skipif(os.name != "posix", reason="forks")
 def test_a_fork_of_a_process_that_has_used_the_bus_is_refused_one() -> None:
-    """As by `multiprocessing` where it forks: told with the remedy, where Zenoh would hang."""
+    """A fork, as `multiprocessing` makes it: told with the remedy, where Zenoh would hang."""
     subprocess.run([sys.executable, "-c", FORKED], check=True, timeout=BOUND)

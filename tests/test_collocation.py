@@ -31,7 +31,7 @@ RATES = [10.0**exponent for exponent in range(-3, 7)]
 """kh of the exchanges."""
 
 DISTANCES = [NEAREST, 0.7, 1.0, 1.3, 2.0, FARTHEST]
-"""Of the earlier point from T, in units of h."""
+"""Distances of the earlier point from T, in units of h."""
 
 
 class Slave:
@@ -116,7 +116,7 @@ def flow_cut(kh: float) -> Sequence[Slave]:
 
 
 def lagging_flow(kh: float) -> Sequence[Slave]:
-    """The same with a flow that follows ten times faster than it empties the integrator."""
+    """An integrator and a flow that follows ten times faster than it empties it."""
     return Slave(0.0, 1.0), Slave(10.0 * kh, -10.0 * kh * kh)
 
 
@@ -185,7 +185,7 @@ def follower_values(begin: float, size: float, degree: int) -> FloatArray:
 
 
 def observed_order(errors: Sequence[float]) -> float:
-    """Of errors at sizes that are halved each time, between the last two."""
+    """Order of errors at sizes that are halved each time, between the last two."""
     return float(np.log2(errors[-2] / errors[-1]))
 
 
@@ -276,7 +276,7 @@ def test_without_past_points_the_error_is_not_told_too_small() -> None:
 
 
 def test_the_earlier_point_is_neither_near_nor_far() -> None:
-    """Of those far enough the nearest, unless it is too far."""
+    """The nearest point of those far enough is taken, unless it is too far."""
     assert earlier_point([0.0, -0.3, -0.6, -1.0], 1.0) == 2
     assert earlier_point([0.0, -0.3], 1.0) is None
     assert earlier_point([0.0, -4.1], 1.0) is None

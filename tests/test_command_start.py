@@ -1,4 +1,4 @@
-"""How commands begin: Ctrl-C while their modules are imported, and hosts that give too little."""
+"""Beginnings of commands: Ctrl-C while modules are imported, and hosts that give too little."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def limited(megabytes: int, *words: object) -> subprocess.CompletedProcess[str]:
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the limit is not that of ulimit -v")
 @pytest.mark.parametrize("megabytes", [250, 400, 600])
 def test_too_little_memory_is_named(megabytes: int, tmp_path: Path) -> None:
-    """Of the command itself or of a slave that it launches: cause and remedy, and no traceback."""
+    """Limits of the command itself or of a slave that it launches: cause, remedy, no traceback."""
     file = EXAMPLES / "displacement_python.toml"
     done = limited(megabytes, "-m", "master_node", "run", file, "--output", tmp_path / "out")
     assert done.returncode == 3, done.stderr

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import corpus
-from benchmarks.bounded import Bound, Outcome, adopt_orphans, run_bounded
+from benchmarks.bounded import Bound, Outcome, run_bounded
 from benchmarks.corpus.comparison import compare, is_same
 from benchmarks.corpus.experiment import experiment_of
 from benchmarks.corpus.fmpy_loop import regular_rows, scalars
@@ -119,7 +119,6 @@ def test_the_lag_answers_boundedly(y: float, t: float, base: float, amplitude: f
 
 def bounded(code: str, folder: Path, seconds: float = 60.0, memory: float = 1e12) -> Outcome:
     """Python code as a command."""
-    adopt_orphans()
     return run_bounded([sys.executable, "-c", code], folder, {"WORD": "x"}, seconds, memory)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,17 +11,7 @@ from hypothesis import Phase, assume, example, given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System
-from protocol.calls import StepResult
-from protocol.slave import (
-    Causality,
-    InputDerivatives,
-    Slave,
-    SlaveDescription,
-    StartValue,
-    StateKind,
-    StepStatus,
-    Variable,
-)
+from tests.jump_models import ExactSlave
 from tests.quarter_car_case import ALL, LinearSystem, run_slaves
 
 Jumps = Sequence[tuple[float, float]]
@@ -36,84 +26,16 @@ OSCILLATOR = LinearSystem(
 )
 
 
-class JumpingSource(Slave):
+class JumpingSource(ExactSlave):
     """y jumps by a at t_i, for each (t_i, a); from t_i on it has the new value."""
 
     def __init__(self, jumps: Jumps) -> None:
         self.jumps = jumps
-        self.description = SlaveDescription(
-            model="jumps",
-            kind="test",
-            variables=(Variable("y", Causality.OUTPUT),),
-            capabilities=replace(ALL, max_output_derivative_order=1),
-            state_kind=StateKind.NATIVE,
-            input_derivatives=InputDerivatives.NATIVE,
-        )
-        self.reset()
+        super().__init__((), ("y",), derivatives=True)
 
-    def reset(self) -> None:
-        """See `Slave`."""
-        self.time = 0.0
-
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
-        """See `Slave`."""
-        self.time = start_time
-
-    def exit_initialization_mode(self) -> None:
-        """See `Slave`."""
-
-    def set_inputs(self, derivatives: np.ndarray) -> None:
-        """See `Slave`."""
-
-    def do_step(
-        self, communication_point: float, step_size: float, no_set_state_prior: bool
-    ) -> StepResult:
-        """See `Slave`."""
-        self.time = communication_point + step_size
-        return StepResult(StepStatus.OK, self.time)
-
-    def get_outputs(self, order: int) -> np.ndarray:
-        """See `Slave`."""
-        y = sum(jump for time, jump in self.jumps if self.time >= time)
-        return np.array([[y], [0.0]][: order + 1])
-
-    def get_state(self) -> object:
-        """See `Slave`."""
-        return self.time
-
-    def set_state(self, state: object) -> None:
-        """See `Slave`."""
-        assert isinstance(state, float)
-        self.time = state
-
-    def free_state(self, state: object) -> None:
-        """See `Slave`."""
-
-    def serialize_state(self, state: object) -> bytes:
-        """See `Slave`."""
-        raise NotImplementedError
-
-    def deserialize_state(self, data: bytes) -> object:
-        """See `Slave`."""
-        raise NotImplementedError
-
-    def terminate(self) -> None:
-        """See `Slave`."""
-
-    def close(self) -> None:
-        """See `Slave`."""
+    def read(self, t: float, x: np.ndarray, u: np.ndarray) -> Sequence[Sequence[float]]:
+        """See `ExactSlave`."""
+        return [[sum(jump for time, jump in self.jumps if t >= time)], [0.0]]
 
 
 def driven(jumps: Jumps, **simulation: Any) -> Result:

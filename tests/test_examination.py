@@ -111,7 +111,7 @@ def test_a_slave_with_fixed_steps_is_examined_with_these() -> None:
 # ---- Internal clocks ----------------------------------------------------------------------------
 
 MOVED = {"inputs": (0.0, 0.0), "input_changes": (0.01, 0.1)}
-"""Of `CHASSIS`: what waits for a tick to answer to these has a clock, however slow."""
+"""Inputs of `CHASSIS`: a slave that answers to them at ticks only has a clock, however slow."""
 
 
 @given(st.floats(-2.2, 1.4), st.integers(2, 4))

@@ -73,7 +73,7 @@ def test_a_first_step_that_is_far_too_large(k: float) -> None:
 
 
 def test_extrapolation_does_not_end_without_a_word() -> None:
-    """What is asked for is taken: the summary warns that its estimate tells little."""
+    """The method that is asked for is taken: the summary warns that its estimate tells little."""
     system = vessels(1e2, 1e-3, coupling="explicit", sequence="gauss-seidel")
     result = simulate(system, in_process=True)
     assert errors(result, 1e2, 1e-3).max() > 50.0
@@ -156,7 +156,7 @@ def test_killed_slaves_come_back(tmp_path: Path) -> None:
 
 
 def test_the_example_is_iterated(tmp_path: Path) -> None:
-    """As it stands, over Zenoh: bit for bit as in process; ``steps.csv`` tells the iterations."""
+    """Bit for bit the same over Zenoh and in process; ``steps.csv`` tells the iterations."""
     system = load_system(STIFF / "vessels.toml")
     there = simulate(system, output=tmp_path / "there")
     here = simulate(system, in_process=True)

@@ -119,7 +119,7 @@ def secant(du: float, dy: float) -> Secants:
 def test_linear_systems_are_solved_whatever_their_gain(
     system: Callable[[int, float, int], Linear], gain: float, seed: int
 ) -> None:
-    """As soon as secants span the inputs of each slave, the correction is Newton's: exact."""
+    """The correction is Newton's as soon as secants span the inputs of each slave: exact."""
     linear = system(3, gain, seed)
     width = NODES * len(range(*linear.slices[0].indices(linear.size)))
     number, inputs = linear.evaluations(width + 3)
@@ -152,7 +152,7 @@ def test_correction_of_a_loop_is_the_geometric_series() -> None:
 
 @given(a=st.floats(-50.0, 50.0), b=st.floats(-50.0, 50.0))
 def test_loop_gain_is_the_spectral_radius(a: float, b: float) -> None:
-    """Of the loop of two slaves it is the root of the product of their answers."""
+    """The loop gain of two slaves is the root of the product of their answers."""
     gain = pair([secant(1.0, a), secant(1.0, b)]).loop_gain
     assert gain == pytest.approx(np.sqrt(abs(a * b)), rel=1e-6, abs=1e-7)
 
@@ -215,7 +215,7 @@ def test_directions_are_orthonormal_and_the_newest_come_first() -> None:
 
 
 def test_the_oldest_secants_are_forgotten() -> None:
-    """Of more than the most only the newest stay."""
+    """Only the newest secants stay."""
     secants = Secants()
     for number in range(5):
         secants = secants.pushed(np.array([float(number)]), np.array([0.0]), 3)

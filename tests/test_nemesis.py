@@ -139,7 +139,7 @@ def test_a_difference_between_two_runs_is_found(
 def test_a_process_that_is_left_is_found(
     fmus: Path, tmp_path: Path, shared_router: Router, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that a run started, and that is none of its own; it is ended, and the seed is named."""
+    """A process that a run left is ended, and the seed is named."""
 
     def leave_one(cast: Cast, _: object) -> bool:
         subprocess.run(["sh", "-c", "sleep 600 &"], env=cast._environment(), check=True)

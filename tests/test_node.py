@@ -718,7 +718,7 @@ def test_a_master_says_how_long_it_is_to_be_waited_for(serve: Serve) -> None:
 
 @in_process
 def test_a_master_that_came_back_is_waited_for_anew(serve: Serve) -> None:
-    """What is left of an earlier absence does not count.
+    """The rest of an earlier absence does not count.
 
     On a busy machine an absence may get too long; then both are repeated with more time.
     """

@@ -82,7 +82,7 @@ def test_what_a_model_computes_feeds_inputs(
 def test_it_is_read_however_states_are_saved(
     tmp_path: Path, capability_dir: Path, slave: dict[str, Any]
 ) -> None:
-    """The same solution."""
+    """Both sources give one solution."""
     result = simulate(fed(tmp_path, capability_dir, "s", **slave), in_process=True)
     assert result["sum.x"] == pytest.approx(INTEGRALS["s"](result.time), abs=2e-3)
 

@@ -84,7 +84,7 @@ def test_every_variable_can_be_recorded(capability_dir: Path) -> None:
 def test_recording_changes_nothing_else(
     capability_dir: Path, version: int, slave: dict[str, Any], simulation: dict[str, Any]
 ) -> None:
-    """The same outputs bit for bit, the same round trips; one more call in requests that read."""
+    """Outputs bit for bit and round trips stay; requests that read have one more call."""
     plain, recorded = (
         simulate(
             drives(capability_dir, version, results=results, **slave).with_simulation(**simulation),
@@ -165,7 +165,7 @@ def test_recorded_variables_are_read_with_the_outputs(capability_dir: Path, tmp_
 
 
 def test_on_a_grid_continuous_ones_are_interpolated_and_others_held(capability_dir: Path) -> None:
-    """As outputs are: by the polynomials through communication points, or as before."""
+    """They are read as outputs are: by polynomials through communication points, or as before."""
     system = drives(capability_dir, results={"locals": LOCALS})
     grid = simulate(system.with_simulation(output_interval=0.05), in_process=True)
     assert grid.time == pytest.approx(np.arange(21) * 0.05)

@@ -24,7 +24,7 @@ def described(*variables: str, version: str = "2.0") -> Element:
 
 
 def variability(root: Element) -> list[str | None]:
-    """Of all variables."""
+    """Variabilities of all variables."""
     return [variable.get("variability") for variable in root.iterfind("./ModelVariables/*")]
 
 

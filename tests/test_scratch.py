@@ -56,7 +56,7 @@ def holder(place: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
 def test_what_a_killed_process_leaves_is_removed_by_the_next(
     holder: tuple[subprocess.Popen[str], Path], place: Path
 ) -> None:
-    """As long as it lives its directory stays, then the next who makes one removes it."""
+    """Its directory stays as long as it lives, then the next who makes one removes it."""
     process, left = holder
     assert left.parent == place
     with ScratchDirectory() as own:

@@ -160,7 +160,7 @@ def command(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
 def test_json_is_json(
     verb: str, model: str, capability_fmu: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    """Whatever the model prints, and whereto, until the process has ended."""
+    """Standard output, whatever the model prints, and whereto, until the process has ended."""
     fmu = model if ":" in model else capability_fmu(model)
     done = command("slave_node", verb, "--json", fmu, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -170,7 +170,7 @@ def test_json_is_json(
 
 
 def test_a_quiet_run_is_quiet(capability_fmu: Callable[[str], Path], tmp_path: Path) -> None:
-    """What models print in process does not come on the standard output of the run."""
+    """Prints of models in process do not come on the standard output of the run."""
     models = {"a": capability_fmu("changes_process"), "b": MEDDLER}
     tables = [f"[slaves.{name}]\nmodel = '{model}'\n" for name, model in models.items()]
     (tmp_path / "system.toml").write_text("[simulation]\nstop_time = 0.1\n" + "".join(tables))

@@ -83,7 +83,7 @@ def test_a_terminate_that_fails_does_not_fail_the_run(  # noqa: PLR0917
 def test_a_failed_end_in_process_is_told_too(
     function: str, tmp_path: Path, capability_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same without processes: also where the end of the instance meets the same accident."""
+    """In process too, and where the end of the instance meets the same accident."""
     monkeypatch.setenv("ACCIDENT", f"{function} error")
     system = load_system(lag_file(tmp_path, capability_dir))
     result = simulate(system, in_process=True)
@@ -99,7 +99,7 @@ def test_an_fmu_that_refuses_a_choice_of_its_log_runs_all_the_same(
     capability_dir: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What it logs is no part of what it computes; a crash there is one."""
+    """Its log is no part of its results; a crash there is one."""
     monkeypatch.setenv("ACCIDENT", f"fmi2SetDebugLogging {accident}")
     system = load_system(lag_file(tmp_path, capability_dir))
     if outcome:
@@ -154,7 +154,7 @@ def test_loading_and_initialization_may_take_longer_than_a_step(
     capability_dir: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What takes 3 s at the start is no reason to give up, where a step has 2 s."""
+    """A start of 3 s is no reason to give up, where a step has 2 s."""
     monkeypatch.setenv("ACCIDENT", f"{function} 3.0")
     file = lag_file(tmp_path, capability_dir, bus, 'estimator = "none"\n')
     assert simulate(load_system(file)).summary["outcome"] == "completed"
@@ -192,7 +192,7 @@ def step(number: int = 0) -> DoStep:
 
 
 def test_each_kind_of_work_has_its_bound() -> None:
-    """What one request has a slave do, one after the other, may take the sum of the bounds."""
+    """Calls of one request, one after the other, may take the sum of their bounds."""
     assert bound([Describe()]) == (1.0, "step_timeout")
     assert bound([Configure()]) == (5.0, "load_timeout")
     assert bound([Reset()]) == (5.0, "load_timeout")

@@ -22,7 +22,7 @@ rows_of_numbers = st.lists(st.tuples(numbers, numbers, numbers), min_size=1, max
 
 
 def table(folder: Path, text: str, file: str = "t.csv", encoding: str = "utf-8") -> TextTable:
-    """What is read of a text."""
+    """Table that is read of a text."""
     (folder / file).write_bytes(text.encode(encoding))
     return read_text_table(folder / file)
 

@@ -41,7 +41,7 @@ def tuned(
 
 
 def integral(times: np.ndarray, changes: Any, values: Any) -> np.ndarray:
-    """Of what holds from each of the times on."""
+    """Integral of a value that changes, each time to hold from there on."""
     ends = (*changes[1:], np.inf)
     parts = [
         v * np.clip(times - a, 0.0, b - a) for a, b, v in zip(changes, ends, values, strict=True)
@@ -96,7 +96,7 @@ def test_a_function_tunes_a_parameter(capability_dir: Path) -> None:
 
 
 def test_a_constant_is_its_start_value(capability_dir: Path) -> None:
-    """The same bits as from ``parameters``."""
+    """They give the bits that ``parameters`` give."""
     here = simulate(tuned(capability_dir, gain=2.5), in_process=True)
     slave = {"parameters": {"gain": 2.5}}
     there = simulate(tuned(capability_dir, slave=slave, mode=1), in_process=True)
@@ -106,7 +106,7 @@ def test_a_constant_is_its_start_value(capability_dir: Path) -> None:
 def test_the_same_bits_over_the_bus_and_after_a_resume(
     capability_dir: Path, tmp_path: Path, no_process_left: None
 ) -> None:
-    """What a parameter was tuned to is there again after a run was broken off between changes."""
+    """Tuned values are there again after a run was broken off between changes."""
     rows = "".join(f"{time};{gain}\n" for time, gain in zip(CHANGES, GAINS, strict=True))
     (tmp_path / "gain.csv").write_text(f"t;gain\n{rows}", encoding="utf-8")
     table = {"table": "gain.csv", "interpolation": "hold", "extrapolate": "hold"}

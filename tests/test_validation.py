@@ -95,7 +95,7 @@ class Truth:
     remark: str = ""
     clocks: str = ""
     slopes: str = ""
-    """What going back tells of output derivatives."""
+    """Output derivatives after going back."""
     reset: str = "done"
 
 

@@ -136,7 +136,7 @@ def test_what_would_be_rounded_or_guessed_is_refused(
 
 
 def test_an_item_is_given_by_its_name_or_its_number() -> None:
-    """What is neither is told with the items that there are, and the nearest name."""
+    """Others are told with the items that there are, and the nearest name."""
     assert [value_of(MODE, name) for name in ITEMS] == [-1, 0, 1, 5]
     assert [parsed(MODE, text) for text in ("fast", "5", " 5.0 ")] == [5, 5, 5]
     items = r"Enumeration with the items reverse \(-1\), neutral \(0\), forward \(1\), fast \(5\)"
@@ -346,7 +346,7 @@ def test_a_function_beyond_the_bounds_ends_the_run(tmp_path: Path, capability_di
 def test_parameters_of_a_served_slave_are_checked_before_it_is_on_the_bus(
     capability_dir: Path,
 ) -> None:
-    """As those of a system file; it may be told to ignore bounds."""
+    """They are checked as those of a system file; it may be told to ignore bounds."""
     description = described(capability_dir / "drive2.fmu")
     check_parameters(description, {"n": 4.0, "mode": "fast"})
     with pytest.raises(ConfigurationError, match=r"'n' must be at most 8 \(max\).*ignore-bounds"):

@@ -11,7 +11,7 @@ BOUND = 240.0
 """No wait in a test is longer [s]; it is for what hangs, not for what is slow."""
 
 _START_TIME = 0.1
-"""What a start of Python with NumPy takes at least [s] on any machine that is not busy."""
+"""Least time of a start of Python with NumPy on any machine that is not busy [s]."""
 
 
 def wait_until(condition: Callable[[], object], say: Callable[[], str] = str) -> None:

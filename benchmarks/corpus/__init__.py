@@ -15,7 +15,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.bounded import adopt_orphans
 from benchmarks.corpus.models import CorpusModel, distinct_models
 from benchmarks.corpus.table import COLUMNS, by_tool, coupling_reasons, faults, reasons
 from benchmarks.corpus.trials import Bounds, try_model
@@ -59,7 +58,6 @@ def _records(
     models: Iterable[CorpusModel], folder: Path, bounds: Bounds, *, again: bool
 ) -> list[dict[str, Any]]:
     """The record of each model, from its file or by trying it."""
-    adopt_orphans()
     folder.mkdir(parents=True, exist_ok=True)
     records = []
     models = list(models)

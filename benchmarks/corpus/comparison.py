@@ -47,7 +47,7 @@ def compare(result: Result, slave: str, columns: Mapping[str, Sequence[object]])
 
 
 def is_same(one: object, other: object) -> bool:
-    """Whether two values are the same to the bit; any NaN is as good as another."""
+    """Equality of two values to the bit; any NaN equals any other one."""
     if not isinstance(one, float):
         return one == other
     theirs = float(other)  # type: ignore[arg-type]

@@ -72,6 +72,6 @@ def _number(element: Any, attribute: str) -> float | None:
 
 
 def _is_continuous(variable: Any) -> bool:
-    """Whether a scalar variable takes part in an error-controlled coupling."""
+    """True if a scalar variable takes part in an error-controlled coupling."""
     is_scalar = variable.type in ("Real", "Float64") and not variable.dimensions
     return is_scalar and variable.variability in (None, "continuous")

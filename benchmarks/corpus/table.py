@@ -76,7 +76,7 @@ def faults(records: Iterable[Record]) -> Iterator[str]:
 
 
 def is_refused(record: Record) -> bool:
-    """Whether the model does not run alone with the defaults, for a reason that was told."""
+    """True if the model does not run alone with the defaults, for a reason that was told."""
     return record.get("alone", {}).get("end") == End.REFUSED
 
 

@@ -1,4 +1,4 @@
-"""What is tried with one model, each trial in processes of its own, and how it ended."""
+"""Trials of one model, each in processes of its own, and their ends."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ class _Trials:
         return Trial(end, how, outcome.seconds)
 
     def comparison(self) -> dict[str, Any] | None:
-        """Of both; None: one of them did not end."""
+        """Comparison of both; None: one of them did not end."""
         result = self._result("fixed")
         if result is None or result.summary.get("outcome") != "completed":
             return None

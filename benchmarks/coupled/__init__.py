@@ -16,7 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from benchmarks.bounded import adopt_orphans, run_bounded
+from benchmarks.bounded import run_bounded
 from benchmarks.corpus.models import distinct_models
 from benchmarks.coupled.systems import SYSTEMS
 
@@ -52,7 +52,6 @@ def main(words: list[str]) -> None:
         parser.error(f"{options.folder} is not a folder")
     fmus = {model.sha256[:8]: model for model in distinct_models(options.folder)}
     names = [name for name in SYSTEMS if options.only in name]
-    adopt_orphans()
     records: list[Record] = []
     for name in names:
         print(name, file=sys.stderr, flush=True)

@@ -55,7 +55,7 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What was found.
+    """Findings about one system.
 
     Attributes:
         outcome: of the run with the defaults; "refused" where it raised.

@@ -32,13 +32,13 @@ MIDDLE = 0.7
 """Where the first node lies, as a part of h. See the module's docstring."""
 
 NODES = 2
-"""How many nodes there are: the ends of both small steps."""
+"""Number of nodes: the ends of both small steps."""
 
 NEAREST = 0.5
 """Distance of an earlier point from T, as a part of h, below which degree 3 is not stable."""
 
 FARTHEST = 4.0
-"""The same beyond which it is of no more use than degree 2."""
+"""Distance of an earlier point from T, as a part of h, beyond which it gains nothing."""
 
 TELLING = 1.5
 """Error of the predictor over that of the polynomial of degree 3, below which their distance does
@@ -117,7 +117,7 @@ def milne_factor(known: Sequence[float], nodes: Sequence[float], past: Sequence[
 
 
 def _tells(known: Sequence[float], nodes: Sequence[float], past: Sequence[float]) -> bool:
-    """Whether the distance from the predictor tells the error; unasked where it has no points."""
+    """True if the distance from the predictor tells the error, or the predictor has no points."""
     order = len(known) + len(nodes)
     if len(past) < order:
         return True

@@ -49,7 +49,7 @@ class OutputHistory:
         )
 
     def can_compare(self, order: int) -> bool:
-        """Whether there is a point more than the polynomials of a step of order k need."""
+        """True if there is a point more than the polynomials of a step of order k need."""
         return len(self.times) > max(_HERMITE_POINTS, order + 2)
 
     def at(

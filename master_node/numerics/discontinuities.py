@@ -36,8 +36,8 @@ _PART = 0.5
 """Of a change that was foreseen: a smaller defect is one of a smooth input."""
 
 _SHARE = 0.1
-"""Of the jump that is looked for: a smaller one beside it is not met. A larger one is, as several
-jumps of an input may lie in one bracket."""
+"""Part of the jump that is looked for, above which another one beside it is met too: several jumps
+of an input may lie in one bracket."""
 
 _SURPRISE, _TWICE = 10.0, 2.0
 """How many times larger than expected, and than the change that was foreseen, a defect is that only
@@ -121,6 +121,11 @@ class Defects(NamedTuple):
     def within_tolerance(middle: FloatArray, end: FloatArray, scale: FloatArray) -> Defects:
         """Where no defect is above 1."""
         return Defects(middle, end, middle, end, middle, end, scale)
+
+    @property
+    def are_within_tolerance(self) -> bool:
+        """True if no defect is above 1."""
+        return self.expected_end is self.end
 
     @property
     def largest(self) -> FloatArray:
@@ -241,6 +246,8 @@ class Search(NamedTuple):
             is_accurate: whether ERR is within the tolerance.
         """
         jumping = np.zeros(len(self.doubts), dtype=bool)
+        if defects.are_within_tolerance:
+            return jumping
         if is_accurate:
             jumping |= defects.jumps_at_end(self.doubts)
             if not self.is_at_point:

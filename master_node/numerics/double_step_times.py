@@ -54,7 +54,7 @@ class DoubleStepTimes(NamedTuple):
         return DoubleStepTimes(begin, middle, middle + second, first, second, step_size)
 
     def with_middle(self, part: float) -> DoubleStepTimes:
-        """The same with the middle at ``part`` of the way, 0 to 1."""
+        """This double step with its middle at ``part`` of the way, 0 to 1."""
         middle = self.begin + part * (self.end - self.begin)
         return DoubleStepTimes.through(self.begin, middle, self.end, self.step_size)
 

@@ -1,4 +1,4 @@
-"""How slaves answer to their inputs, from what they have answered: secants, and what follows.
+"""Jacobians of slaves from differences of their answers, and of the interface between them.
 
 In an iterated step the inputs U at its nodes are wanted for which U = c(Y(U)). Each evaluation of
 Y is one request to all slaves. A slave's outputs depend on its own inputs alone, so differences of
@@ -16,9 +16,11 @@ tells how much of it there is, and by how much stiffness might enlarge it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.signals import FloatArray
 
@@ -59,7 +61,7 @@ class Interface(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """What is to be added to the inputs at the nodes.
+    """Correction of the inputs at the nodes.
 
     Attributes:
         inputs: (I - J)^-1 residual, shape (nodes, n), unit [u].
@@ -105,9 +107,10 @@ class InterfaceJacobian:
         self._directions = np.array(directions).reshape(number, scale.size)
         self._answers = np.array(answers).reshape(number, scale.size)
         self._projected = self._directions @ self._answers.T
-        self._inverse = self._inverted()
 
-    def _inverted(self) -> FloatArray | None:
+    @cached_property
+    def _inverse(self) -> FloatArray | None:
+        """(I - Q^T W)^-1; None where there is none."""
         if not np.isfinite(self._projected).all():
             return None
         matrix: FloatArray = np.eye(len(self._projected)) - self._projected
@@ -147,6 +150,27 @@ class InterfaceJacobian:
         size = float(np.sqrt(found @ found / max(1, len(found))))
         unknown = gain * float(np.sqrt(rest @ rest / max(1, len(rest))))
         return Correction(found.reshape(self._scale.shape) * self._scale, size, unknown)
+
+
+def loop_gain_bound(
+    inputs: FloatArray,
+    answers: FloatArray,
+    slave_of_input: NDArray[np.intp],
+    slave_of_source: NDArray[np.intp],
+) -> float:
+    """Bound of the loop gain that one secant of each slave tells: J's Frobenius norm.
+
+    Args:
+        inputs: differences of the inputs, in tolerances, shape (n,).
+        answers: differences of the inputs that belong to the outputs' differences, in tolerances,
+            shape (n,).
+        slave_of_input: number of the slave that has the input, shape (n,).
+        slave_of_source: number of the slave that feeds it, shape (n,).
+    """
+    slaves = int(slave_of_source.max(initial=0)) + 1
+    squares = np.bincount(slave_of_input, inputs * inputs, slaves).take(slave_of_source)
+    told = squares > 0.0
+    return float(np.sqrt((answers[told] ** 2 / squares[told]).sum()))
 
 
 def orthonormal(secants: Secants, scale: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:

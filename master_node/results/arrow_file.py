@@ -291,7 +291,7 @@ def _told(field: pa.Field, key: bytes) -> str:
 
 
 def _items(field: pa.Field) -> dict[str, int]:
-    """Of an enumeration the number of each item by its name; empty for others."""
+    """Numbers of an enumeration's items by their names; empty for other types."""
     try:
         items = json.loads(_told(field, b"items") or "{}")
     except ValueError:

@@ -29,7 +29,7 @@ class Recording:
         self._steps = Steps()
 
     def set_settings(self, settings: Mapping[str, object]) -> None:
-        """What the run goes on with, after its slaves were examined."""
+        """Set the system with which the run goes on, after its slaves were examined."""
         self._settings = plain_mapping(settings)
 
     def started(self, start: RunStart) -> None:

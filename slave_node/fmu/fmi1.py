@@ -62,7 +62,7 @@ class Fmi1Instance(FmuInstance):
         return FMU1Slave  # type: ignore[no-any-return]
 
     def _load(self, name: str) -> Any:
-        """As everywhere; FMPy takes the statuses of most functions for texts, and reads them."""
+        """See `FmuInstance`; FMPy takes the statuses of most functions for texts to read."""
         fmu = super()._load(name)
         for known, function in fmu._functions.items():
             if function.restype is ctypes.c_char_p and known not in _TEXTS:

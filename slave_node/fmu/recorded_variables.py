@@ -28,7 +28,7 @@ class RecordedVariables:
         self._others = instance.discrete([name for name in names if not places[name].type.is_real])
 
     def values(self) -> RecordedValues:
-        """What they have now."""
+        """Their present values."""
         return RecordedValues(
             np.array([self._reals.receive()], dtype=np.float64), self._others.receive()
         )

@@ -13,6 +13,7 @@ from collections.abc import Set as AbstractSet
 from fcntl import F_GETFL, fcntl
 from pathlib import Path
 
+from protocol.descriptors import is_open
 from protocol.errors import SlaveError
 
 _TASKS = "/proc/self/task"
@@ -28,7 +29,7 @@ class ForkHindrances:
     """Compares what the process has now with what it had before its model was loaded."""
 
     def __init__(self) -> None:
-        self._descriptors = {d for d in _open_descriptors() if _is_open(d)}
+        self._descriptors = {d for d in _open_descriptors() if is_open(d)}
         self._shared_memory = _shared_memory()
         self._was_checked = False
 
@@ -104,14 +105,6 @@ def reopen(readers: list[Reader]) -> None:
 def _open_descriptors() -> set[int]:
     """All, and the one that the listing itself needed."""
     return {int(name) for name in os.listdir(_DESCRIPTORS)}  # noqa: PTH208  as above
-
-
-def _is_open(descriptor: int) -> bool:
-    try:
-        os.fstat(descriptor)
-    except OSError:
-        return False
-    return True
 
 
 def _shared_memory() -> set[str]:

@@ -1,4 +1,4 @@
-"""What of a holder's answer is the same when the same is done again from the same state."""
+"""Parts of a holder's answer that repeat when the same is done again from the same state."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ _ALIKE = 0.75
 """Largest difference of successive changes, relative to the larger one, in a smooth signal."""
 
 _NO_MATTER = 1e-3
-"""Of the tolerance: outputs that move by less, but do move, have no clock that matters."""
+"""Part of the tolerance: outputs that move by less, but do move, have no clock that matters."""
 
 
 class SlowError(Exception):
@@ -95,7 +95,7 @@ def _changes(place: Place, size: float) -> list[FloatArray] | None:
 
 
 def _switches(place: Place, size: float, changes: list[FloatArray], period: float) -> bool:
-    """Whether outputs jump by themselves: no input waits for ticks, and these are few or unlike.
+    """True if outputs jump by themselves: no input waits for ticks, and these are few or unlike.
 
     A grid on such ticks takes jumps for samples of something smooth: of a signal that is 1 in every
     second period its points see a constant.
@@ -113,14 +113,14 @@ def _switches(place: Place, size: float, changes: list[FloatArray], period: floa
 
 
 def _are_samples(heights: FloatArray) -> bool:
-    """Whether changes at successive ticks, shape (ticks, n), may be those of one smooth signal."""
+    """True if changes at successive ticks, shape (ticks, n), may be those of one smooth signal."""
     before, behind = heights[:-1], heights[1:]
     larger = np.maximum(np.abs(before), np.abs(behind))
     return bool(np.all(np.abs(behind - before) <= _ALIKE * larger))
 
 
 def _waits_for_ticks(place: Place, size: float, moves: list[bool]) -> bool:
-    """Whether the outputs answer to inputs that are moved between two ticks, and not before one."""
+    """True if the outputs answer to inputs that are moved between two ticks, and not before one."""
     trial = place.trial
     if not trial.call.inputs:
         return False

@@ -27,12 +27,12 @@ _FAR, _NEAR = 0.9, 0.5
 with each other (a factor of ten, or another sign), and that agree."""
 
 _SEEN = 0.1
-"""Of the tolerance: where neither derivative nor difference would change an output by more in h,
-nothing is said."""
+"""Part of the tolerance: where neither derivative nor difference would change an output by more in
+h, nothing is said."""
 
 _SAME = 1e-3
-"""Of the change of a derivative over h: it is the difference if it is nearer to it than this. A
-true derivative is off by half of the change."""
+"""Part of the change of a derivative over h: it is the difference if it is nearer to it than this.
+A true derivative is off by half of the change."""
 
 _ROUNDING = 1e-9
 
@@ -80,7 +80,7 @@ def poor_derivatives(trial: Trial, pair_of: Callable[[float], Pair]) -> dict[str
 
 
 class Verdict(NamedTuple):
-    """Of each output, shape (n,).
+    """Verdicts on each output, shape (n,).
 
     Attributes:
         not_finite: its derivative is finite nowhere.
@@ -96,7 +96,7 @@ class Verdict(NamedTuple):
 
 
 def judge(pairs: Sequence[Pair], scale: Callable[[FloatArray, FloatArray], FloatArray]) -> Verdict:
-    """What some pairs of steps say together.
+    """Verdict of some pairs of steps together.
 
     Args:
         pairs: at least one.

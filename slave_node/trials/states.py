@@ -18,7 +18,7 @@ GOES_BACK = (StateVerdict.EXACT, StateVerdict.RESTARTS_SOLVER)
 
 
 class States(NamedTuple):
-    """What was seen.
+    """Observation of saved states.
 
     Attributes:
         verdict, reason, difference: see `Examination`.
@@ -97,7 +97,7 @@ def _judged(
     restored: list[tuple[Reading, Reading]],
     stood: tuple[Reading, Reading],
 ) -> States:
-    """What pairs of readings say that are to be the same.
+    """Verdict on pairs of readings that are to be the same.
 
     Args:
         trial: of the slave.

@@ -41,7 +41,7 @@ def step_counters(place: Place) -> tuple[str, ...]:
 
 
 def step_dependence(place: Place) -> tuple[float, float | None]:
-    """How much one step of 2h differs from two of h, and up to which h it does not matter [s].
+    """Difference of one step of 2h from two of h, and the h up to which it does not matter [s].
 
     That difference is looked for with larger and larger h. When it is more than the tolerance h is
     halved until it is `SUBSTEP_ERROR` of it; None where there is no need, or no such h.

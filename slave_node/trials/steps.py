@@ -83,7 +83,7 @@ class Trial:
 
     @property
     def takes_any_step(self) -> bool:
-        """Whether its steps may have any size."""
+        """True if its steps may have any size."""
         description = self.slave.description
         return (
             description.capabilities.can_handle_variable_step_size
@@ -92,7 +92,7 @@ class Trial:
 
     @property
     def follows_inputs(self) -> bool:
-        """Whether it has inputs that it follows within a step."""
+        """True if it has inputs that it follows within a step."""
         derivatives = self.slave.description.input_derivatives
         is_emulated = derivatives is InputDerivatives.EMULATED
         return bool(self.call.inputs) and (self.call.input_order > 0 or is_emulated)

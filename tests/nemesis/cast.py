@@ -32,10 +32,10 @@ _RESTART_TIME = 0.3
 """After which a service manager starts a process again [s]."""
 
 _PATIENCE = 2.0
-"""How long a victim is looked for that is not there yet [s]."""
+"""Time for which a victim is looked for that is not there yet [s]."""
 
 _TIME_TO_END = 60.0
-"""What processes have to end [s]."""
+"""Time that processes have to end [s]."""
 
 
 class Cast:
@@ -190,7 +190,7 @@ class Cast:
             )
 
     def _times_ready(self, name: str) -> int:
-        """How often one of this name has come up."""
+        """Number of times that a process of this name has come up."""
         return self.told().get(name, "").count("ready: ")
 
     def _manage(self) -> None:
@@ -233,7 +233,7 @@ class Cast:
             time.sleep(0.01)
 
     def left(self) -> list[str]:
-        """What still runs of it all, after a while in which it may end; that is ended."""
+        """Processes that still run after a while in which they may end; these are ended."""
         marked = [p for p in psutil.process_iter() if _is_marked(p, self._mark)]
         _, alive = psutil.wait_procs(marked, timeout=_TIME_TO_END)
         told = []
@@ -246,7 +246,7 @@ class Cast:
         return told
 
     def told(self) -> dict[str, str]:
-        """What processes wrote to their standard error, by name."""
+        """Texts of processes on their standard error, by name."""
         logs = sorted(self._folder.glob("*.log"))
         return {log.stem: log.read_text(encoding="utf-8", errors="replace") for log in logs}
 

@@ -1,4 +1,4 @@
-"""What a nemesis does to whom, and when."""
+"""Faults of a nemesis, their victims and moments."""
 
 from __future__ import annotations
 

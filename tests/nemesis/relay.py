@@ -11,7 +11,7 @@ from protocol.endpoints import free_endpoint
 from tests.waiting import BOUND
 
 _SLOWNESS = 0.02
-"""How much later all comes while it is slowed down [s]."""
+"""Delay of all messages while the relay is slowed down [s]."""
 
 
 class Relay:

@@ -35,12 +35,12 @@ _SERVICES = ("node", "agent")
 
 
 class BrokenLawError(AssertionError):
-    """What must not happen has happened."""
+    """A law was broken."""
 
 
 @dataclass
 class Outcome:
-    """What became of one seed.
+    """Outcome of one seed.
 
     Attributes:
         system: that was run.
@@ -93,7 +93,7 @@ class _Nemesis:
         self.attempts += 1
 
     def watch(self, cast: Cast) -> None:
-        """Whom it happens to."""
+        """Keep the cast, to which the faults happen."""
         self._cast = cast
 
     def wait(self) -> None:
@@ -192,7 +192,7 @@ def _codes_of_services(faults: Sequence[Fault]) -> set[int | None]:
 
 
 def _is_lost(fault: Fault, system: DrawnSystem, is_started_again: bool) -> bool:
-    """Whether the master may not be able to replace what was killed, see docs/recovery.md."""
+    """True if the master may not be able to replace what was killed, see docs/recovery.md."""
     if fault.part == "agent" or system.way == "in process":
         return True
     is_loading = fault.attempt == 0 or is_started_again

@@ -11,7 +11,7 @@ from random import Random
 from typing import Any, Literal
 
 Way = Literal["in process", "launched", "routed", "served", "agent"]
-"""How slaves are run: by the master, by it through a router, by hand, or by an agent."""
+"""Ways to run slaves: by the master, by it through a router, by hand, or by an agent."""
 
 _WAYS: tuple[Way, ...] = ("in process", "launched", "launched", "routed", "served", "agent")
 
@@ -33,7 +33,7 @@ _SYSTEMS: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class DrawnSystem:
-    """What a seed runs.
+    """System that a seed runs.
 
     Attributes:
         name: of the example.
