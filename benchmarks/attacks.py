@@ -18,11 +18,10 @@ from pathlib import Path
 import psutil
 import zenoh
 
-from protocol.administration import Claimed
-from protocol.agents import CHUNK_BYTES, Upload
-from protocol.codec import encode_map, encode_record
-from protocol.endpoints import free_endpoint
-from protocol.keys import (
+from protocol.bus.endpoints import free_endpoint
+from protocol.wire.administration import Claimed
+from protocol.wire.agents import CHUNK_BYTES, Upload
+from protocol.wire.keys import (
     CLAIM,
     STATUS,
     UPLOAD,
@@ -31,6 +30,7 @@ from protocol.keys import (
     alive_agents,
     alive_slaves,
 )
+from protocol.wire.packing import encode_map, encode_record
 
 _EXAMPLES = Path(__file__).parents[1] / "examples"
 _LARGE = bytes(60 * 2**20)

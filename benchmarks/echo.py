@@ -3,8 +3,8 @@
 import signal
 import sys
 
-from protocol.endpoints import Endpoints
-from protocol.zenoh_bus import ZenohBus
+from protocol.bus.endpoints import Endpoints
+from protocol.bus.zenoh import ZenohBus
 
 
 def main(endpoint: str, key: str) -> None:

@@ -8,10 +8,10 @@ from fmpy.fmi2 import FMU2Slave
 
 from benchmarks.interleaved import Interleaved
 from benchmarks.quarter_car import EXAMPLE, system
-from master_node.co_simulation import CoSimulation
-from master_node.slave_group import SlaveGroup
-from master_node.slaves import slaves_in_process
-from master_node.system import resolve
+from master_node.coupling.coupled_system import resolve
+from master_node.hosts.opening import slaves_in_process
+from master_node.running.co_simulation import CoSimulation
+from master_node.slaves.group import SlaveGroup
 
 H = 1e-3
 

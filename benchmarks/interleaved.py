@@ -5,7 +5,7 @@ from time import perf_counter
 
 import numpy as np
 
-from master_node.observers import Attempt, RunEnd, RunStart
+from master_node.observing.observers import Attempt, RunEnd, RunStart
 
 BLOCK = 1
 

@@ -8,10 +8,10 @@ from types import ModuleType
 
 from benchmarks.interleaved import Interleaved
 from master_node import System
-from master_node.co_simulation import CoSimulation
-from master_node.slave_group import SlaveGroup
-from master_node.slaves import slaves_in_process, slaves_on_bus
-from master_node.system import resolve
+from master_node.coupling.coupled_system import resolve
+from master_node.hosts.opening import slaves_in_process, slaves_on_bus
+from master_node.running.co_simulation import CoSimulation
+from master_node.slaves.group import SlaveGroup
 
 CAPABILITIES = Path(__file__).parents[1] / "examples" / "capabilities"
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import psutil
 
 from benchmarks.quarter_car import system
-from master_node.co_simulation import CoSimulation
-from master_node.observers import Attempt, Observers, RunEnd, RunStart
+from master_node.coupling.coupled_system import resolve
+from master_node.hosts.opening import slaves_on_bus
+from master_node.observing.observers import Attempt, Observers, RunEnd, RunStart
 from master_node.results import ResultsWriter
-from master_node.slave_group import SlaveGroup
-from master_node.slaves import slaves_on_bus
-from master_node.system import resolve
+from master_node.running.co_simulation import CoSimulation
+from master_node.slaves.group import SlaveGroup
 
 ATTEMPTS = int(os.environ.get("DOUBLESTEP_MEMORY_ATTEMPTS", "1000000"))
 H = 1e-3

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from benchmarks.interleaved import Interleaved
 from benchmarks.quarter_car import ESTIMATOR_NAMES, system
-from master_node.co_simulation import CoSimulation
-from master_node.slave_group import SlaveGroup
-from master_node.slaves import slaves_on_bus
-from master_node.system import resolve
-from protocol.endpoints import Endpoints, free_endpoint
-from protocol.zenoh_bus import ZenohBus
+from master_node.coupling.coupled_system import resolve
+from master_node.hosts.opening import slaves_on_bus
+from master_node.running.co_simulation import CoSimulation
+from master_node.slaves.group import SlaveGroup
+from protocol.bus.endpoints import Endpoints, free_endpoint
+from protocol.bus.zenoh import ZenohBus
 
 
 def run() -> list[tuple[str, str, str, str]]:

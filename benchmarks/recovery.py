@@ -13,14 +13,14 @@ from time import perf_counter, sleep
 import psutil
 
 from benchmarks.quarter_car import system
-from master_node.checkpoints import Checkpoints
-from master_node.co_simulation import CoSimulation
-from master_node.observers import Attempt, RunEnd, RunStart
-from master_node.restorable_slave import RestorableSlave
-from master_node.slave_group import SlaveGroup
-from master_node.slave_link import SlaveLink
-from master_node.slaves import slaves_on_bus
-from master_node.system import resolve
+from master_node.coupling.coupled_system import resolve
+from master_node.hosts.opening import slaves_on_bus
+from master_node.observing.observers import Attempt, RunEnd, RunStart
+from master_node.resuming.checkpoints import Checkpoints
+from master_node.running.co_simulation import CoSimulation
+from master_node.slaves.group import SlaveGroup
+from master_node.slaves.link import SlaveLink
+from master_node.slaves.restorable import RestorableSlave
 
 _KILLS = 20
 _ATTEMPTS_BETWEEN = 150

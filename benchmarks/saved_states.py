@@ -11,11 +11,11 @@ import psutil
 
 from benchmarks.interleaved import Interleaved
 from benchmarks.quarter_car import ESTIMATOR_NAMES, EXAMPLE, system
-from master_node.co_simulation import CoSimulation
-from master_node.configure_slaves import configure
-from master_node.slave_group import SlaveGroup
-from master_node.slaves import slaves_in_process, slaves_on_bus
-from master_node.system import resolve
+from master_node.coupling.coupled_system import resolve
+from master_node.hosts.opening import slaves_in_process, slaves_on_bus
+from master_node.preparing.configuring import configure
+from master_node.running.co_simulation import CoSimulation
+from master_node.slaves.group import SlaveGroup
 from protocol.calls import Configure
 from slave_node.loading import load_slave
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.stiff_systems import SYSTEMS, reference
 from master_node import Result, simulate
-from master_node.observers import Attempt, RunEnd, RunStart
+from master_node.observing.observers import Attempt, RunEnd, RunStart
 from protocol.errors import DoublestepError
 
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)

@@ -8,13 +8,13 @@ from time import perf_counter
 import numpy as np
 
 from benchmarks.quarter_car import ESTIMATOR_NAMES, system
-from master_node.co_simulation import CoSimulation
-from master_node.configuration import System
-from master_node.observers import Attempt, RunEnd, RunStart
-from master_node.slave_group import SlaveGroup
-from master_node.slaves import slaves_on_bus
-from master_node.system import resolve
-from protocol.credentials import Role
+from master_node.coupling.coupled_system import resolve
+from master_node.hosts.opening import slaves_on_bus
+from master_node.observing.observers import Attempt, RunEnd, RunStart
+from master_node.running.co_simulation import CoSimulation
+from master_node.slaves.group import SlaveGroup
+from master_node.system.system import System
+from protocol.bus.credentials import Role
 from slave_node.certificates import Host, make_certificates
 
 _WARM_UP = 200

@@ -6,7 +6,10 @@ from importlib import import_module
 
 TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than all else here
 if TYPE_CHECKING:
-    from master_node.configuration import (
+    from master_node.results import Result
+    from master_node.simulation import resume, simulate
+    from master_node.system.files import open_system
+    from master_node.system.system import (
         BusSettings,
         Connection,
         InputSettings,
@@ -16,9 +19,6 @@ if TYPE_CHECKING:
         System,
         load_system,
     )
-    from master_node.results import Result
-    from master_node.simulation import resume, simulate
-    from master_node.system_files import open_system
 
 __all__ = [
     "BusSettings",

@@ -10,19 +10,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from master_node.agent_models import Uploading
-from master_node.checkpoint_files import CheckpointStore
-from master_node.checkpoints import Checkpoints, ResultPosition, Resumed
-from master_node.co_simulation import CoSimulation, check_capabilities
-from master_node.configuration import InputSettings, System
-from master_node.configure_slaves import configure
-from master_node.examinations import as_plain_data
-from master_node.external_resolution import Signals
-from master_node.input_loading import load_signals
-from master_node.model_hashes import check_hashes
-from master_node.observers import Observer, Observers
-from master_node.preparation import prepare
-from master_node.restorable_slave import RestorableSlave
+from master_node.coupling.coupled_system import resolve
+from master_node.coupling.external import Signals
+from master_node.coupling.step_sizes import check_step_sizes, with_bounded_steps, with_fixed_steps
+from master_node.hosts.agent_models import Uploading
+from master_node.hosts.model_hashes import check_hashes
+from master_node.hosts.opening import Slaves, slaves_in_process, slaves_on_bus
+from master_node.inputs.loading import load_signals
+from master_node.observing.observers import Observer, Observers
+from master_node.preparing.configuring import configure
+from master_node.preparing.examinations import as_plain_data
+from master_node.preparing.preparation import prepare
 from master_node.results import (
     Recording,
     Result,
@@ -35,7 +33,10 @@ from master_node.results import (
     is_complete,
 )
 from master_node.results.files import cannot_write
-from master_node.resumption import (
+from master_node.results.trace import TraceWriter
+from master_node.resuming.checkpoints import Checkpoints, ResultPosition, Resumed
+from master_node.resuming.files import CheckpointStore
+from master_node.resuming.saved_system import (
     RunMode,
     can_be_saved,
     check_models,
@@ -43,18 +44,17 @@ from master_node.resumption import (
     reopened,
     saved_system,
 )
-from master_node.shared_process import Baseline, SharedProcess, shared_process
-from master_node.slave_group import SlaveGroup
-from master_node.slaves import Slaves, slaves_in_process, slaves_on_bus
-from master_node.step_size_rules import check_step_sizes, with_bounded_steps, with_fixed_steps
-from master_node.system import resolve
-from master_node.trace import TraceWriter
-from master_node.trust import check_own
+from master_node.running.co_simulation import CoSimulation, check_capabilities
+from master_node.slaves.group import SlaveGroup
+from master_node.slaves.restorable import RestorableSlave
+from master_node.slaves.shared_process import Baseline, SharedProcess, shared_process
+from master_node.system.system import InputSettings, System
+from master_node.system.trust import check_own
+from protocol.description import SlaveDescription
 from protocol.errors import InterruptedRunError
-from protocol.names import some
-from protocol.new_files import own_folder
-from protocol.scratch import ScratchDirectory
-from protocol.slave import SlaveDescription
+from protocol.host.new_files import own_folder
+from protocol.host.scratch import ScratchDirectory
+from protocol.text.names import some
 
 log = logging.getLogger("master_node")
 

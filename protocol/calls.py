@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from protocol.signals import MAX_ORDER, FloatArray
 
 if TYPE_CHECKING:
     from protocol.errors import DoublestepError
-    from protocol.slave import StartValue, StepStatus
+    from protocol.variables import StartValue
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,6 +293,18 @@ CALLS: tuple[type[Call], ...] = (
     Terminate,
     Reset,
 )
+
+
+class StepStatus(StrEnum):
+    """How a do_step ended when it raised nothing.
+
+    ``EARLY_RETURN``: the slave stands at an event within the step (FMI 3.0, section 4.2.1.2.1).
+    """
+
+    OK = "ok"
+    DISCARD = "discard"
+    EARLY_RETURN = "early_return"
+    TERMINATED = "terminated"
 
 
 class StepResult(NamedTuple):

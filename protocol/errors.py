@@ -31,8 +31,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, Self
 
-from protocol.plain_text import printable
-from protocol.text_limits import cut
+from protocol.text.limits import cut
+from protocol.text.plain_text import printable
 
 _TEXT_FIELDS = ("slave", "phase", "remedy")
 _NUMBER_FIELDS = ("time", "step_size", "last_successful_time")

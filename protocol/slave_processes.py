@@ -16,7 +16,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Final
 
-from protocol.endpoints import Endpoints, Mode
+from protocol.bus.endpoints import Endpoints, Mode
 from protocol.errors import (
     ConfigurationError,
     DeadlineError,
@@ -25,9 +25,9 @@ from protocol.errors import (
     SlaveCrashedError,
     SlaveLostError,
 )
-from protocol.keys import SlaveKey
-from protocol.new_files import open_new, open_old
-from protocol.python_processes import python_command
+from protocol.host.new_files import open_new, open_old
+from protocol.host.python_processes import python_command
+from protocol.wire.keys import SlaveKey
 
 _END_TIME = 2.0
 _KILL_TIME = 5.0

@@ -13,8 +13,8 @@ from struct import pack
 
 import numpy as np
 
-from protocol.names import nearest
-from protocol.slave import StartValue, Variable, VariableType
+from protocol.text.names import nearest
+from protocol.variables import StartValue, Variable, VariableType
 
 _TRUTH = {"true": True, "false": False}
 _WHOLE = re.compile(r"[+-]?[0-9]+")

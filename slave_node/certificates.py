@@ -1,7 +1,7 @@
 """Certificates for a small laboratory: one authority, and one certificate for each host and role.
 
 The authority's key stays where it was made. A host gets its own directory, which holds what
-``--tls`` needs (`protocol.credentials.Credentials`).
+``--tls`` needs (`protocol.bus.credentials.Credentials`).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from protocol.credentials import AUTHORITY, Role
+from protocol.bus.credentials import AUTHORITY, Role
 from protocol.errors import ConfigurationError
-from protocol.keys import check_name
+from protocol.wire.keys import check_name
 
 _AUTHORITY_KEY = "ca-key.pem"
 _AUTHORITY_DAYS = 3650

@@ -29,17 +29,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from protocol.description import Capabilities, InputDerivatives, SlaveDescription, StateKind
 from protocol.errors import ModelError
-from protocol.names import nearest
 from protocol.signals import FloatArray
-from protocol.slave import (
-    Capabilities,
-    Causality,
-    InputDerivatives,
-    SlaveDescription,
-    StateKind,
-    Variable,
-)
+from protocol.text.names import nearest
+from protocol.variables import Causality, Variable
 
 Values = FloatArray | Sequence[float]
 """What a model may return: an array, or a list or tuple of numbers."""

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import psutil
 
 from master_node import Result, System, load_system, resume, simulate
-from protocol.endpoints import free_endpoint
+from protocol.bus.endpoints import free_endpoint
 from tests.test_processes import system_file, worker_of
 from tests.waiting import BOUND
 

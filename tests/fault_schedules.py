@@ -12,22 +12,22 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from random import Random
 
-from master_node.co_simulation import CoSimulation
-from master_node.configuration import System
-from master_node.observers import Attempt, RunEnd, RunStart
-from master_node.presence import Presence
-from master_node.remote_slave import RemoteSlave
-from master_node.request_bounds import RequestBounds
-from master_node.slave_group import SlaveGroup
-from master_node.slaves import claim_slave, claimed_slaves, describe
-from master_node.system import resolve
-from protocol.bus import Bus
+from master_node.coupling.coupled_system import resolve
+from master_node.hosts.opening import claim_slave, claimed_slaves, describe
+from master_node.hosts.presence import Presence
+from master_node.observing.observers import Attempt, RunEnd, RunStart
+from master_node.running.co_simulation import CoSimulation
+from master_node.slaves.group import SlaveGroup
+from master_node.slaves.remote import RemoteSlave
+from master_node.slaves.request_bounds import RequestBounds
+from master_node.system.system import System
+from protocol.bus.bus import Bus
 from protocol.calls import Call, Reply
-from protocol.codec import decode_map, encode_map
+from protocol.description import SlaveDescription
 from protocol.errors import DoublestepError, SlaveCrashedError
-from protocol.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey, alive_master
-from protocol.slave import SlaveDescription
-from slave_node.node import SlaveNode
+from protocol.wire.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey, alive_master
+from protocol.wire.packing import decode_map, encode_map
+from slave_node.serving.node import SlaveNode
 from tests.faulty_bus import NO_FAULTS, Faults, FaultyBus, Network
 from tests.light_slaves import COUPLINGS, LightWorker, system_of_light_slaves
 from tests.virtual_clock import VirtualClock

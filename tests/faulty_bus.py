@@ -13,10 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random
 
-from protocol.bus import AliveListener, Bus, Caller, Handler, PendingReply
-from protocol.bus import matches as pattern_matches
+from protocol.bus.bus import AliveListener, Bus, Caller, Handler, PendingReply
+from protocol.bus.bus import matches as pattern_matches
+from protocol.bus.room import Room
 from protocol.errors import DeadlineError, SlaveLostError
-from protocol.room import Room
 from tests.virtual_clock import VirtualClock, Waiter
 
 

@@ -16,11 +16,17 @@ from random import Random
 import msgpack
 import zenoh
 
-from protocol.administration import Claim, SlaveStatus
 from protocol.calls import CALLS
-from protocol.codec import PROTOCOL_VERSION, decode_map, encode_map, encode_program, encode_request
 from protocol.errors import DoublestepError
-from protocol.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey, alive_slaves
+from protocol.wire.administration import Claim, SlaveStatus
+from protocol.wire.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey, alive_slaves
+from protocol.wire.packing import (
+    PROTOCOL_VERSION,
+    decode_map,
+    encode_map,
+    encode_program,
+    encode_request,
+)
 from tests.fuzz.messages import PROGRAMS, Mutator
 
 _VERBS = (EXECUTE, CLAIM, RELEASE, ABORT, STATUS, *(call.verb for call in CALLS))

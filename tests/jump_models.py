@@ -8,18 +8,11 @@ from math import cos, factorial, sin
 
 import numpy as np
 
-from protocol.calls import StepResult
+from protocol.calls import StepResult, StepStatus
+from protocol.description import InputDerivatives, SlaveDescription, StateKind
 from protocol.signals import InputSignal
-from protocol.slave import (
-    Causality,
-    InputDerivatives,
-    Slave,
-    SlaveDescription,
-    StartValue,
-    StateKind,
-    StepStatus,
-    Variable,
-)
+from protocol.slave import Slave
+from protocol.variables import Causality, StartValue, Variable
 from tests.quarter_car_case import ALL
 
 

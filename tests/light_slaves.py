@@ -11,22 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from protocol.calls import StepResult
+from protocol.calls import StepResult, StepStatus
+from protocol.description import Capabilities, InputDerivatives, SlaveDescription, StateKind
 from protocol.errors import SlaveCrashedError, SlaveError
 from protocol.signals import FloatArray
-from protocol.slave import (
-    Capabilities,
-    Causality,
-    InputDerivatives,
-    Slave,
-    SlaveDescription,
-    StartValue,
-    StateKind,
-    StepStatus,
-    Variable,
-)
-from slave_node.executor import Executor
-from slave_node.worker import ModelReference, execute_program
+from protocol.slave import Slave
+from protocol.variables import Causality, StartValue, Variable
+from slave_node.execution.executor import Executor
+from slave_node.worker.process import ModelReference, execute_program
 
 COUPLINGS = {"left": 2.0, "right": -2.0}
 """b of x' = -x + b u of the two slaves."""

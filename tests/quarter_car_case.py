@@ -17,36 +17,28 @@ import numpy as np
 from scipy.linalg import expm
 
 from master_node import Result, System
-from master_node.co_simulation import CoSimulation, check_capabilities
-from master_node.coupling_scheme import CouplingScheme
-from master_node.double_step import DoubleStep, DoubleStepper
-from master_node.error_control import ErrorControl, StepError
-from master_node.initialization import initialize
+from master_node.coupling.coupled_system import CoupledSystem, resolve
+from master_node.coupling.scheme import CouplingScheme
+from master_node.judging.comparison import ErrorControl, StepError
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import ESTIMATORS
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
-from master_node.observers import Observer, Observers
+from master_node.observing.observers import Observer, Observers
+from master_node.preparing.initialization import initialize
 from master_node.results import Recording
+from master_node.running.co_simulation import CoSimulation, check_capabilities
 from master_node.simulation import settings_of
-from master_node.slave_group import SlaveGroup
-from master_node.slave_link import LocalSlave
-from master_node.system import CoupledSystem, resolve
-from protocol.calls import StepResult
+from master_node.slaves.group import SlaveGroup
+from master_node.slaves.link import LocalSlave
+from master_node.stepping.double_step import DoubleStep, DoubleStepper
+from protocol.calls import StepResult, StepStatus
+from protocol.description import Capabilities, InputDerivatives, SlaveDescription, StateKind
 from protocol.signals import InputSignal
-from protocol.slave import (
-    Capabilities,
-    Causality,
-    InputDerivatives,
-    Slave,
-    SlaveDescription,
-    StartValue,
-    StateKind,
-    StepStatus,
-    Variable,
-)
-from slave_node.executor import Executor
+from protocol.slave import Slave
+from protocol.variables import Causality, StartValue, Variable
+from slave_node.execution.executor import Executor
 from slave_node.loading import load_slave
-from slave_node.model_loading import load_model_class
+from slave_node.python.loading import load_model_class
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "quarter_car"
 

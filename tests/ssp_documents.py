@@ -13,10 +13,10 @@ import pytest
 from typer.testing import CliRunner
 
 from master_node import System
-from master_node.cli import app
-from master_node.system_files import ImportedSystem, read_ssp
+from master_node.cli.app import app
+from master_node.system.files import ImportedSystem, read_ssp
+from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError
-from protocol.slave import SlaveDescription
 
 SCHEMAS = Path(fmpy.ssp.__file__).parent / "schema"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import sleep
 from typing import Any
 
-from protocol.slave import Variable, VariableType
+from protocol.variables import Variable, VariableType
 from slave_node.model import Model, real
 
 

@@ -26,11 +26,24 @@ import psutil
 import pytest
 
 from master_node import System, load_system, simulate
-from master_node.agent_models import ModelPlacing, Sent, WantedModel
-from master_node.agent_requests import SeenAgent
-from master_node.agents import Agents
+from master_node.hosts.agent_models import ModelPlacing, Sent, WantedModel
+from master_node.hosts.agent_requests import SeenAgent
+from master_node.hosts.agents import Agents
 from master_node.simulation import run as run_system
-from protocol.agents import (
+from protocol.bus.bus import InProcessBus
+from protocol.bus.credentials import Role
+from protocol.bus.endpoints import Mode
+from protocol.errors import (
+    ConfigurationError,
+    DoublestepError,
+    MalformedMessageError,
+    ModelError,
+    ProtocolError,
+    SlaveBusyError,
+    SlaveLostError,
+    VersionError,
+)
+from protocol.wire.agents import (
     CHUNK_BYTES,
     AgentModel,
     AgentSlave,
@@ -47,33 +60,19 @@ from protocol.agents import (
     Upload,
     UploadState,
 )
-from protocol.bus import InProcessBus
-from protocol.codec import (
+from protocol.wire.keys import MODELS, OUTPUT, START, STOP, UPLOAD, AgentKey, MasterKey, SlaveKey
+from protocol.wire.packing import (
     PROTOCOL_VERSION,
     decode_record,
     encode_error_map,
     encode_map,
     encode_record,
 )
-from protocol.credentials import Role
-from protocol.endpoints import Mode
-from protocol.errors import (
-    ConfigurationError,
-    DoublestepError,
-    MalformedMessageError,
-    ModelError,
-    ProtocolError,
-    SlaveBusyError,
-    SlaveLostError,
-    VersionError,
-)
-from protocol.keys import MODELS, OUTPUT, START, STOP, UPLOAD, AgentKey, MasterKey, SlaveKey
-from slave_node import upload_cache
-from slave_node.agent import Agent, Offer, Surroundings
-from slave_node.agent_options import default_cache, parse_labels, parse_licences, places_of
+from slave_node.agent.agent import Agent, Offer, Surroundings, upload_cache
+from slave_node.agent.model_store import ModelStore
+from slave_node.agent.options import default_cache, parse_labels, parse_licences, places_of
+from slave_node.agent.upload_cache import UploadCache
 from slave_node.certificates import Host, make_certificates
-from slave_node.model_store import ModelStore
-from slave_node.upload_cache import UploadCache
 from tests.quarter_car_case import DISPLACEMENT, EXAMPLES
 from tests.test_network import Commands
 from tests.test_processes import FOREVER, Command, Gates, endpoints, has_stepped, toml

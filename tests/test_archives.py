@@ -16,10 +16,11 @@ from typing import NamedTuple
 
 import pytest
 
-from master_node.checkpoint_files import CheckpointStore
-from master_node.system_files import import_system, open_system
-from protocol import archives
-from protocol.archives import (
+from master_node.resuming.files import CheckpointStore
+from master_node.system.files import import_system, open_system
+from protocol.errors import DoublestepError, ModelError, ResultsError
+from protocol.host import archives
+from protocol.host.archives import (
     MAX_XML_ATTRIBUTES,
     MAX_XML_DEPTH,
     MAX_XML_ELEMENTS,
@@ -27,7 +28,6 @@ from protocol.archives import (
     check_xml,
     read_entry,
 )
-from protocol.errors import DoublestepError, ModelError, ResultsError
 from slave_node.loading import describe_model
 from tests.ssp_documents import ssd, system
 
@@ -247,7 +247,7 @@ def test_nested_packages_share_one_limit_of_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A hundred packages within a package may not each fill what one may."""
-    monkeypatch.setattr("master_node.ssp.reading.MAX_TOTAL_BYTES", 3_000_000)
+    monkeypatch.setattr("master_node.system.ssp.reading.MAX_TOTAL_BYTES", 3_000_000)
     inner = tmp_path / "inner.ssp"
     with zipfile.ZipFile(inner, "w") as package:
         package.writestr("SystemStructure.ssd", ssd(system("")))

@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from master_node import System, simulate
-from master_node.observers import Attempt
+from master_node.observing.observers import Attempt
 from master_node.results import Result
 from master_node.simulation import resume, run
 from protocol.errors import SlaveError

@@ -13,10 +13,10 @@ from queue import Empty, SimpleQueue
 
 import pytest
 
-from protocol.bus import Bus, InProcessBus
-from protocol.endpoints import Endpoints, host_of
+from protocol.bus.bus import Bus, InProcessBus
+from protocol.bus.endpoints import Endpoints, host_of
+from protocol.bus.zenoh import ZenohBus
 from protocol.errors import ConfigurationError, DeadlineError, DoublestepError, SlaveLostError
-from protocol.zenoh_bus import ZenohBus
 from tests.waiting import BOUND, is_quick
 
 
@@ -447,9 +447,9 @@ def test_a_malformed_endpoint_is_refused_with_the_form(text: str) -> None:
 
 FORKED = """
 import os, signal
-from protocol.endpoints import Endpoints
+from protocol.bus.endpoints import Endpoints
 from protocol.errors import ConfigurationError
-from protocol.zenoh_bus import ZenohBus
+from protocol.bus.zenoh import ZenohBus
 
 def opens() -> bool:
     try:

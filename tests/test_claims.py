@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule
 
 from protocol.errors import SequenceError, SlaveBusyError
-from slave_node.claims import Claims, Holder
+from slave_node.serving.claims import Claims, Holder
 
 Request = tuple[int, int]  # epoch, sequence number
 

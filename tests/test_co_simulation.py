@@ -17,8 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System, load_system, simulate
-from master_node.observers import Attempt, RunEnd, RunStart
-from protocol.calls import Call, DoStep, Reply, StepResult
+from master_node.observing.observers import Attempt, RunEnd, RunStart
+from protocol.calls import Call, DoStep, Reply, StepResult, StepStatus
+from protocol.description import Capabilities
 from protocol.errors import (
     ConfigurationError,
     InterruptedRunError,
@@ -26,8 +27,8 @@ from protocol.errors import (
     StepRejectedError,
     StepSizeError,
 )
-from protocol.slave import Capabilities, Slave, StepStatus
-from slave_node.executor import Executor
+from protocol.slave import Slave
+from slave_node.execution.executor import Executor
 from tests.quarter_car_case import (
     CHASSIS,
     D_C,

@@ -15,7 +15,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from protocol import codec
 from protocol import errors as errors_module
 from protocol.calls import (
     CALLS,
@@ -40,9 +39,28 @@ from protocol.calls import (
     SetInputs,
     SetState,
     StepResult,
+    StepStatus,
     Terminate,
 )
-from protocol.codec import (
+from protocol.description import (
+    Capabilities,
+    Examination,
+    InputDerivatives,
+    SlaveDescription,
+    StateKind,
+    StateVerdict,
+)
+from protocol.errors import (
+    DoublestepError,
+    MalformedMessageError,
+    ProtocolError,
+    SlaveError,
+    StepRejectedError,
+    VersionError,
+)
+from protocol.variables import Causality, Unit, Variable, VariableType
+from protocol.wire import packing as codec
+from protocol.wire.packing import (
     MAX_CALLS,
     MAX_MESSAGE_BYTES,
     PROTOCOL_VERSION,
@@ -58,27 +76,6 @@ from protocol.codec import (
     encode_reply,
     encode_request,
     encode_single_reply,
-)
-from protocol.errors import (
-    DoublestepError,
-    MalformedMessageError,
-    ProtocolError,
-    SlaveError,
-    StepRejectedError,
-    VersionError,
-)
-from protocol.slave import (
-    Capabilities,
-    Causality,
-    Examination,
-    InputDerivatives,
-    SlaveDescription,
-    StateKind,
-    StateVerdict,
-    StepStatus,
-    Unit,
-    Variable,
-    VariableType,
 )
 
 # ---- What can be said --------------------------------------------------------------------------

@@ -25,7 +25,7 @@ import os, signal, sys
 class Interrupt:
     number = None
     def find_spec(self, name, *_):
-        if name in ("master_node.cli", "slave_node.cli"):
+        if name in ("master_node.cli.app", "slave_node.cli.app"):
             Interrupt.number = 0
         if Interrupt.number is not None:
             Interrupt.number += 1

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from master_node.compare import compare
-from master_node.observers import Attempt, Outcome, Point, RunEnd, RunStart, Statistics
+from master_node.observing.observers import Attempt, Outcome, Point, RunEnd, RunStart, Statistics
 from master_node.results import ResultsWriter
+from master_node.results.compare import compare
 from protocol.errors import ResultsError
 
 Columns = Mapping[str, Sequence[float]]

@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master_node import BusSettings, ResultsSettings, SimulationSettings, System, load_system
-from master_node.configuration import OutputTolerance, SlaveSettings
+from master_node.hosts.opening import slaves_on_bus
 from master_node.numerics.extrapolation import InputPolynomial
 from master_node.simulation import settings_of
-from master_node.slaves import slaves_on_bus
-from master_node.toml_files import MAX_BYTES
+from master_node.system.system import OutputTolerance, SlaveSettings
+from master_node.system.toml_files import MAX_BYTES
 from protocol.errors import ConfigurationError
-from protocol.toml_text import toml_value
+from protocol.host.toml_text import toml_value
 from tests.quarter_car_case import EXAMPLES
 
 SYSTEM = """

@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 from master_node.numerics.extrapolation import POLYNOMIALS, InputPolynomial
-from protocol.slave import Capabilities, InputDerivatives, Slave
-from slave_node.substeps import SubstepSlave, with_substeps
+from protocol.description import Capabilities, InputDerivatives
+from protocol.slave import Slave
+from slave_node.substeps.slave import SubstepSlave, with_substeps
 from tests.quarter_car_case import (
     ALL,
     CHASSIS,

@@ -180,7 +180,7 @@ def test_an_end_is_judged_by_code_and_words(outcome: dict[str, Any], end: End) -
 @pytest.mark.slow
 def test_a_traceback_of_ours_is_one_and_that_of_a_model_is_none(tmp_path: Path) -> None:
     """An FMU in Python may print what it likes; frames of our packages mean a fault of ours."""
-    ours = bounded("from master_node.system_files import load_system; load_system(3)", tmp_path)
+    ours = bounded("from master_node.system.files import load_system; load_system(3)", tmp_path)
     theirs = bounded("import traceback; 1 / 0", tmp_path)
     repeated = Outcome(0, "", theirs.stderr, 1.0, None, ())
     assert judged(ours).end is End.TRACEBACK

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from master_node.coupling_memory import CALM, LASTING, STIFF, CouplingMemory
+from master_node.methods.coupling_memory import CALM, LASTING, STIFF, CouplingMemory
 
 FIRST = CouplingMemory()
 ITERATING = FIRST.after_explicit(1.0).iterating(())

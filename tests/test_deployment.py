@@ -22,14 +22,14 @@ import pytest
 import yaml
 from typer.main import get_command
 
-import master_node.cli
-import slave_node.cli
+import master_node.cli.app
+import slave_node.cli.app
 from master_node import Result, load_system, simulate
 from tests.waiting import BOUND, wait_until
 
 ROOT = Path(__file__).parents[1]
 
-APPS = {"master-node": master_node.cli.app, "slave-node": slave_node.cli.app}
+APPS = {"master-node": master_node.cli.app.app, "slave-node": slave_node.cli.app.app}
 MANIFESTS = sorted((ROOT / "deploy" / "kubernetes").glob("*.yaml"))
 UNITS = sorted((ROOT / "deploy" / "systemd").glob("*.service"))
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text(encoding="utf-8"))

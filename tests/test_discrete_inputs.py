@@ -14,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master_node import InputSettings, Result, System, simulate
-from master_node.discrete_inputs import legal_value
+from master_node.inputs.discrete import legal_value
+from protocol.description import StateKind
 from protocol.errors import ConfigurationError, SlaveError
-from protocol.slave import Causality, StartValue, StateKind, Variable, VariableType
+from protocol.variables import Causality, StartValue, Variable, VariableType
 from tests.quarter_car_case import ALL, LinearSlave, LinearSystem, Run, run_slaves
 
 STOP = 2.0

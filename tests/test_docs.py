@@ -26,23 +26,13 @@ from scipy.linalg import expm
 from typer.main import get_command
 from typer.testing import CliRunner
 
-import master_node.cli
-import slave_node.cli
-from master_node import remote_slave, simulate
-from master_node.configuration import (
-    BusSettings,
-    Connection,
-    InputSettings,
-    OutputTolerance,
-    ResultsSettings,
-    SimulationSettings,
-    SlaveSettings,
-    System,
-    load_system,
-)
+import master_node.cli.app
+import slave_node.cli.app
+from master_node import simulate
+from master_node.hosts.opening import remote as remote_slave
 from master_node.numerics.error_estimators import EST_MOD, EST_RICH
 from master_node.numerics.reductions import REDUCTIONS
-from master_node.run_metrics import RunMetrics
+from master_node.observing.metrics import RunMetrics
 from master_node.study.configuration import (
     Cases,
     Resources,
@@ -54,13 +44,27 @@ from master_node.study.configuration import (
 from master_node.study.configuration import ResultSettings as StudyResults
 from master_node.study.plan import Plan
 from master_node.study.table import StudyTable
-from protocol import codec, errors, text_limits
+from master_node.system.system import (
+    BusSettings,
+    Connection,
+    InputSettings,
+    OutputTolerance,
+    ResultsSettings,
+    SimulationSettings,
+    SlaveSettings,
+    System,
+    load_system,
+)
+from protocol import errors
 from protocol.calls import CALLS
+from protocol.description import Capabilities, SlaveDescription
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState
 from protocol.signals import MAX_ORDER
-from protocol.slave import Capabilities, SlaveDescription, Variable
-from slave_node.metrics import CountingWorker
-from slave_node.snapshots import LIMIT
+from protocol.variables import Variable
+from protocol.wire import packing as codec
+from protocol.wire import text_limits
+from slave_node.execution.snapshots import LIMIT
+from slave_node.serving.metrics import CountingWorker
 from tests.light_slaves import LightWorker
 from tests.waiting import BOUND, wait_until
 
@@ -71,7 +75,7 @@ DOCUMENTS = sorted(
     for path in ROOT.rglob("*.md")
     if not any(part.startswith(".") for part in path.relative_to(ROOT).parts)
 )
-APPS = {"master-node": master_node.cli.app, "slave-node": slave_node.cli.app}
+APPS = {"master-node": master_node.cli.app.app, "slave-node": slave_node.cli.app.app}
 
 
 def read(name: str) -> str:

@@ -14,9 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.calls import Examine, ExitInitializationMode, GetOutputs, Initialize, Reset
+from protocol.description import Examination, StateKind, StateVerdict
 from protocol.errors import FatalSlaveError
-from protocol.slave import Causality, Examination, Slave, StateKind, StateVerdict
-from slave_node.executor import Executor
+from protocol.slave import Slave
+from protocol.variables import Causality
+from slave_node.execution.executor import Executor
 from slave_node.loading import load_slave
 from tests.jump_models import ExactSlave
 from tests.quarter_car_case import ALL

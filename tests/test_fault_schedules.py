@@ -14,10 +14,10 @@ from random import Random
 
 import pytest
 
-from master_node.remote_slave import RemoteSlave
+from master_node.slaves.remote import RemoteSlave
 from protocol.errors import DeadlineError, SlaveLostError
-from slave_node.claims import Claims
-from slave_node.node import SlaveNode
+from slave_node.serving.claims import Claims
+from slave_node.serving.node import SlaveNode
 from tests.fault_schedules import BrokenLawError, run_schedule
 from tests.faulty_bus import NO_FAULTS, Faults, Network
 from tests.virtual_clock import DeadlockError, TimeIsUpError, VirtualClock

@@ -11,9 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from protocol.calls import StepStatus
+from protocol.description import InputDerivatives, StateKind
 from protocol.errors import ModelError, SlaveError, StepRejectedError
 from protocol.signals import InputSignal
-from protocol.slave import Causality, InputDerivatives, Slave, StartValue, StateKind, StepStatus
+from protocol.slave import Slave
+from protocol.variables import Causality, StartValue
 from slave_node.fmu.description import describe_fmu
 from slave_node.fmu.loading import load_fmu
 

@@ -12,15 +12,17 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from protocol.calls import Configure
+from protocol.calls import Configure, StepStatus
+from protocol.description import InputDerivatives
 from protocol.errors import ModelError, SlaveError
 from protocol.signals import InputSignal
-from protocol.slave import Causality, InputDerivatives, Slave, StartValue, StepStatus, VariableType
+from protocol.slave import Slave
 from protocol.step_sums import step_to
+from protocol.variables import Causality, StartValue, VariableType
 from slave_node.fmu.description import describe_fmu
 from slave_node.fmu.loading import load_fmu
-from slave_node.inspection import description_tables
 from slave_node.loading import load_slave
+from slave_node.validation.report import description_tables
 
 Load = Callable[..., Slave]
 

@@ -17,7 +17,6 @@ from fmpy import platform
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.archives import MAX_ENTRIES
 from protocol.calls import (
     DoStep,
     ExitInitializationMode,
@@ -26,11 +25,14 @@ from protocol.calls import (
     Reset,
     SetInputs,
     SetState,
+    StepStatus,
 )
 from protocol.errors import ModelError, SlaveError, StepRejectedError
+from protocol.host.archives import MAX_ENTRIES
 from protocol.signals import InputSignal
-from protocol.slave import Causality, Slave, StepStatus, VariableType
-from slave_node.executor import Executor
+from protocol.slave import Slave
+from protocol.variables import Causality, VariableType
+from slave_node.execution.executor import Executor
 from slave_node.fmu.archive import extract
 from slave_node.fmu.description import describe_fmu
 from slave_node.fmu.loading import load_fmu

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from master_node import Result, System, simulate
-from master_node.system_files import export_system
-from protocol.archives import checked_archive
+from master_node.system.files import export_system
 from protocol.errors import ModelError
-from protocol.files import Contents, as_file
+from protocol.host.archives import checked_archive
+from protocol.host.files import Contents, as_file
+from slave_node.agent.model_store import ModelStore
 from slave_node.loading import describe_model, load_slave
-from slave_node.model_store import ModelStore
-from slave_node.validation import Grade, validate
+from slave_node.validation.trials import Grade, validate
 from tests.quarter_car_case import DISPLACEMENT
 
 

@@ -17,18 +17,18 @@ from typing import Any
 
 import pytest
 
-import master_node.cli
-import slave_node.cli
-from protocol.administration import SlaveStatus
-from protocol.bus import InProcessBus
-from protocol.codec import PROTOCOL_VERSION, encode_map
-from protocol.endpoints import Endpoints
+import master_node.cli.app
+import slave_node.cli.app
+from protocol.bus.bus import InProcessBus
+from protocol.bus.endpoints import Endpoints
+from protocol.bus.zenoh import ZenohBus
 from protocol.errors import ConfigurationError, DoublestepError, SlaveError
-from protocol.keys import CLAIM, START, STATUS, AgentKey, SlaveKey
-from protocol.logs import LogFormat, configure_logs
-from protocol.plain_text import printable, shortened
-from protocol.processes import ending_signals
-from protocol.zenoh_bus import ZenohBus
+from protocol.host.logs import LogFormat, configure_logs
+from protocol.host.processes import ending_signals
+from protocol.text.plain_text import printable, shortened
+from protocol.wire.administration import SlaveStatus
+from protocol.wire.keys import CLAIM, START, STATUS, AgentKey, SlaveKey
+from protocol.wire.packing import PROTOCOL_VERSION, encode_map
 from tests.quarter_car_case import EXAMPLES
 from tests.ssp_documents import ssd, system
 from tests.test_network import Commands
@@ -102,7 +102,7 @@ def test_errors_and_logs_are_printable(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_nothing_else_prints() -> None:
     """Law: no other module writes to a terminal, or makes cells for it."""
-    places = {"say": "protocol/terminal.py", "cell": "protocol/tables.py"}
+    places = {"say": "protocol/host/terminal.py", "cell": "protocol/host/tables.py"}
     root = Path(__file__).parents[1]
     for package in ("protocol", "slave_node", "master_node"):
         for path in (root / package).rglob("*.py"):
@@ -142,11 +142,11 @@ class World:
 
     def run(self, program: str, *words: object) -> str:
         """Output of a command, whatever its exit code."""
-        main = {"master-node": master_node.cli.main, "slave-node": slave_node.cli.main}[program]
+        app = {"master-node": master_node.cli.app, "slave-node": slave_node.cli.app}[program]
         self._monkeypatch.setattr(sys, "argv", [program, *map(str, words)])
         self._capfd.readouterr()
         with pytest.raises(SystemExit):
-            main()
+            app.main()
         return "".join(self._capfd.readouterr())
 
     def write(self, name: str, text: str) -> Path:
@@ -418,7 +418,7 @@ def test_a_command_shows_texts_of_others_and_obeys_none(
 
 def test_no_command_is_left_out() -> None:
     """A new command needs a hostile test of its own."""
-    apps = {"master-node": master_node.cli.app, "slave-node": slave_node.cli.app}
+    apps = {"master-node": master_node.cli.app.app, "slave-node": slave_node.cli.app.app}
     names = {
         (program, c.name or str(getattr(c.callback, "__name__", "")))
         for program, app in apps.items()
@@ -431,8 +431,8 @@ def test_titles_of_pictures_are_printable(world: World) -> None:
     """Law: no text of a picture holds what is no visible character."""
     from matplotlib.text import Text  # noqa: PLC0415  a second
 
-    from master_node.plots import plot_result  # noqa: PLC0415
     from master_node.results import Result  # noqa: PLC0415
+    from master_node.results.plots import plot_result  # noqa: PLC0415
 
     result = Result.load(world.hostile_results("a"))
     figure = plot_result(result, None, show=False, variables=None)

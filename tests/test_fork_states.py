@@ -28,8 +28,9 @@ from protocol.calls import (
     Reset,
     SetInputs,
     SetState,
+    StepStatus,
 )
-from protocol.codec import decode_reply, encode_program
+from protocol.description import SlaveDescription, StateKind
 from protocol.errors import (
     FatalSlaveError,
     ModelError,
@@ -38,12 +39,14 @@ from protocol.errors import (
     SlaveKilledError,
     StepRejectedError,
 )
-from protocol.slave import Causality, Slave, SlaveDescription, StateKind, StepStatus, VariableType
-from slave_node.deaths import OWN_FAILURE, death
+from protocol.slave import Slave
+from protocol.variables import Causality, VariableType
+from protocol.wire.packing import decode_reply, encode_program
+from slave_node.execution.exit_codes import OWN_FAILURE, death
 from slave_node.states.channel import Channel, Message
 from slave_node.states.fork_habits import Event, Habits
 from slave_node.states.held_process import HeldProcess
-from slave_node.worker import ModelReference, WorkerProcess
+from slave_node.worker.process import ModelReference, WorkerProcess
 from tests.quarter_car_case import DISPLACEMENT
 from tests.state_programs import MODELS, begin, fragile, loaded, wander, wheel
 from tests.trial_slaves import examine

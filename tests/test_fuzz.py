@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from protocol.errors import MalformedMessageError
-from slave_node.claims import Claims
+from slave_node.serving.claims import Claims
 from tests.fuzz import harness
 from tests.fuzz.harness import Service, fuzz
 from tests.fuzz.messages import KINDS, Mutator

@@ -10,8 +10,7 @@ import pytest
 
 from master_node import load_system, simulate
 from master_node.numerics.extrapolation import POLYNOMIALS, InputPolynomial
-from protocol.calls import StepResult
-from protocol.slave import StepStatus
+from protocol.calls import StepResult, StepStatus
 from tests.quarter_car_case import (
     CHASSIS,
     EXAMPLES,

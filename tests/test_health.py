@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from protocol.bus import InProcessBus
-from protocol.credentials import Role
+from protocol.bus.bus import InProcessBus
+from protocol.bus.credentials import Role
 from protocol.errors import SlaveLostError
-from protocol.keys import RouterKey, SlaveKey
+from protocol.wire.keys import RouterKey, SlaveKey
 from slave_node.certificates import Host, make_certificates
-from slave_node.health import check_alive
+from slave_node.serving.health import check_alive
 from tests.quarter_car_case import EXAMPLES
 from tests.waiting import BOUND, wait_until
 

@@ -34,8 +34,10 @@ from protocol.calls import (
     SetInputs,
     SetState,
     StepResult,
+    StepStatus,
     Terminate,
 )
+from protocol.description import SlaveDescription
 from protocol.errors import (
     DoublestepError,
     FatalSlaveError,
@@ -46,9 +48,10 @@ from protocol.errors import (
 )
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState
 from protocol.signals import FloatArray
-from protocol.slave import Slave, SlaveDescription, StartValue, StepStatus
-from slave_node.executor import Executor
-from slave_node.snapshots import LIMIT
+from protocol.slave import Slave
+from protocol.variables import StartValue
+from slave_node.execution.executor import Executor
+from slave_node.execution.snapshots import LIMIT
 
 
 class Recorder(Slave):

@@ -16,10 +16,10 @@ import pytest
 from typer.testing import CliRunner
 
 from master_node import Result, load_system, resume, simulate
-from master_node.cli import app
+from master_node.cli.app import app
 from master_node.results.files import FILES
 from master_node.study.directory import LOCK_FILE, TABLE_FILE
-from master_node.system_files import export_system, import_system, open_system
+from master_node.system.files import export_system, import_system, open_system
 from protocol.errors import (
     ConfigurationError,
     DoublestepError,
@@ -27,8 +27,8 @@ from protocol.errors import (
     ModelError,
     ResultsError,
 )
-from protocol.files import entry_names
-from protocol.new_files import open_new, open_old, own_folder, remove_folder
+from protocol.host.files import entry_names
+from protocol.host.new_files import open_new, open_old, own_folder, remove_folder
 from slave_node.loading import describe_model
 from tests.test_processes import system_file
 from tests.test_resume import Interrupt, car

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from master_node import Result, load_system, simulate
-from protocol.agents import CHUNK_BYTES
+from protocol.wire.agents import CHUNK_BYTES
 from tests.network_namespaces import Hosts
 from tests.test_agents import long_wheel, slave_processes, system_file
 from tests.test_network import Commands, hosts, start

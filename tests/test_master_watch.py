@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from protocol.bus import AliveListener, Bus, Caller, Handler
-from protocol.keys import alive_master
-from protocol.processes import PeerProcess
-from slave_node.master_watch import Master, MasterWatch
+from protocol.bus.bus import AliveListener, Bus, Caller, Handler
+from protocol.host.processes import PeerProcess
+from protocol.wire.keys import alive_master
+from slave_node.serving.master_watch import Master, MasterWatch
 from tests.virtual_clock import VirtualClock
 
 TOKEN = alive_master("r")

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from master_node import Result, System
-from protocol.slave import Capabilities, Slave
+from protocol.description import Capabilities
+from protocol.slave import Slave
 from tests.quarter_car_case import (
     ALL,
     CHASSIS,

@@ -11,9 +11,12 @@ import pytest
 from fmpy.model_description import read_model_description
 from scipy.linalg import expm
 
+from protocol.calls import StepStatus
+from protocol.description import InputDerivatives, StateKind
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import InputSignal
-from protocol.slave import InputDerivatives, Slave, StartValue, StateKind, StepStatus
+from protocol.slave import Slave
+from protocol.variables import StartValue
 from slave_node.fmu.cvode import CVode, Outcome
 from slave_node.fmu.description import describe_fmu
 from slave_node.fmu.interfaces import interface_2

@@ -10,13 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from protocol.calls import StepStatus
 from protocol.errors import ConfigurationError, ModelError, SlaveError, StepRejectedError
 from protocol.signals import InputSignal
-from protocol.slave import Causality, StepStatus, Variable, VariableType
-from slave_node import model_slave
+from protocol.variables import Causality, Variable, VariableType
 from slave_node.model import Model, describe, real
-from slave_node.model_loading import load_model_class
-from slave_node.model_slave import ModelSlave
+from slave_node.python import model_slave
+from slave_node.python.loading import load_model_class
+from slave_node.python.model_slave import ModelSlave
 
 ROOT = Path(__file__).parents[1]
 QUARTER_CAR = "examples/quarter_car/quarter_car.py"

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from master_node import load_system, simulate
-from protocol.endpoints import Endpoints, Mode, free_endpoint
+from protocol.bus.endpoints import Endpoints, Mode, free_endpoint
+from protocol.bus.zenoh import ZenohBus
 from protocol.errors import SlaveLostError
-from protocol.zenoh_bus import ZenohBus
 from tests.network_namespaces import Hosts, hosts_on_a_bridge, unavailable
 from tests.quarter_car_case import EXAMPLES
 from tests.test_processes import MODELS, Command, system_file, toml

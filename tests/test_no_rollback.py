@@ -23,16 +23,17 @@ from master_node.numerics.defect_control import TARGET, foreseen_step_size, larg
 from master_node.numerics.error_estimators import node_polynomial
 from master_node.numerics.initial_step_size import untried_step_size
 from master_node.numerics.step_size_limits import SlaveLimits, StepSizeLimits
-from master_node.observers import Attempt, RunEnd, RunStart
-from master_node.progress import summary_table
-from protocol.calls import StepResult
+from master_node.observing.observers import Attempt, RunEnd, RunStart
+from master_node.observing.progress import summary_table
+from protocol.calls import StepResult, StepStatus
+from protocol.description import Capabilities
 from protocol.errors import (
     ConfigurationError,
     InterruptedRunError,
     SlaveError,
     StepRejectedError,
 )
-from protocol.slave import Capabilities, Slave, StepStatus
+from protocol.slave import Slave
 from tests.quarter_car_case import (
     ALL,
     CHASSIS,

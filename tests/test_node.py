@@ -19,12 +19,13 @@ import msgpack
 import psutil
 import pytest
 
-from master_node.remote_slave import RemoteSlave
-from master_node.request_bounds import RequestBounds
-from master_node.restorable_slave import RestorableSlave
-from master_node.slaves import describe
-from protocol.administration import MAX_ORPHAN_TIME, Claim
-from protocol.bus import Bus, InProcessBus
+from master_node.hosts.opening import describe
+from master_node.slaves.remote import RemoteSlave
+from master_node.slaves.request_bounds import RequestBounds
+from master_node.slaves.restorable import RestorableSlave
+from protocol.bus.bus import Bus, InProcessBus
+from protocol.bus.endpoints import Endpoints
+from protocol.bus.zenoh import ZenohBus
 from protocol.calls import (
     Call,
     Describe,
@@ -35,15 +36,7 @@ from protocol.calls import (
     Reply,
     Reset,
 )
-from protocol.codec import (
-    PROTOCOL_VERSION,
-    decode_map,
-    decode_reply,
-    encode_map,
-    encode_program,
-    encode_request,
-)
-from protocol.endpoints import Endpoints
+from protocol.description import SlaveDescription
 from protocol.errors import (
     ConfigurationError,
     DoublestepError,
@@ -57,7 +50,9 @@ from protocol.errors import (
     SlaveLostError,
     VersionError,
 )
-from protocol.keys import (
+from protocol.host.processes import has_ended
+from protocol.wire.administration import MAX_ORPHAN_TIME, Claim
+from protocol.wire.keys import (
     ABORT,
     CLAIM,
     EXECUTE,
@@ -67,11 +62,16 @@ from protocol.keys import (
     alive_master,
     alive_slaves,
 )
-from protocol.processes import has_ended
-from protocol.slave import SlaveDescription
-from protocol.zenoh_bus import ZenohBus
-from slave_node.node import SlaveNode
-from slave_node.worker import ModelReference, WorkerProcess
+from protocol.wire.packing import (
+    PROTOCOL_VERSION,
+    decode_map,
+    decode_reply,
+    encode_map,
+    encode_program,
+    encode_request,
+)
+from slave_node.serving.node import SlaveNode
+from slave_node.worker.process import ModelReference, WorkerProcess
 from tests.waiting import BOUND, is_quick, wait_until
 
 pytestmark = [

@@ -21,8 +21,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from master_node import Result, load_system, progress, simulate
-from master_node.observers import (
+from master_node import Result, load_system, simulate
+from master_node.observing import progress
+from master_node.observing.observers import (
     Attempt,
     Exchange,
     Outcome,
@@ -31,16 +32,15 @@ from master_node.observers import (
     SlaveStatistics,
     Statistics,
 )
-from master_node.progress import ProgressBar
-from master_node.slave_group import SlaveGroup
-from master_node.trace import TraceWriter
-from protocol.calls import DoStep, GetOutputs, GetState, Reply, SetState, StepResult
-from protocol.codec import encode_error, encode_program, encode_reply
+from master_node.observing.progress import ProgressBar
+from master_node.results.trace import TraceWriter
+from master_node.slaves.group import SlaveGroup
+from protocol.calls import DoStep, GetOutputs, GetState, Reply, SetState, StepResult, StepStatus
 from protocol.errors import ConfigurationError, ResultsError, SlaveCrashedError, SlaveError
-from protocol.logs import LogFormat, about, add_log_fields, configure_logs
-from protocol.metrics import Metric, metrics_served
-from protocol.slave import StepStatus
-from slave_node.metrics import CountingWorker
+from protocol.host.logs import LogFormat, about, add_log_fields, configure_logs
+from protocol.host.metrics import Metric, metrics_served
+from protocol.wire.packing import encode_error, encode_program, encode_reply
+from slave_node.serving.metrics import CountingWorker
 from tests.test_processes import EXAMPLES, FOREVER, Command, has_stepped, start, system_file
 from tests.waiting import BOUND, wait_until
 

@@ -20,7 +20,9 @@ from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 
 from master_node import Result, System, simulate
-from protocol.slave import Causality, Slave, StartValue, StepStatus
+from protocol.calls import StepStatus
+from protocol.slave import Slave
+from protocol.variables import Causality, StartValue
 from slave_node.loading import describe_model, load_slave
 
 MODELS = ("mass", "van_der_pol", "step_source")

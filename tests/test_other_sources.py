@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from master_node import Result, System, load_system, simulate
-from master_node.system_files import export_system, open_system
+from master_node.system.files import export_system, open_system
 from protocol.errors import ConfigurationError
 
 LAG = (

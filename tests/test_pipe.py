@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from slave_node.pipe import Pipe
+from slave_node.worker.pipe import Pipe
 
 LENGTHS = [0, 1, 2**14, 2**14 + 1, 2**20 - 4, 2**20 - 3, 3 * 2**20]
 """Around those where it sends in two parts, and where its buffer ends with and without header."""

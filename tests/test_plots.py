@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from master_node.plots import (
+from master_node.results import STEPS_DTYPE, Result
+from master_node.results.plots import (
     DOTS_PER_INCH,
     PANEL_HEIGHT,
     WIDTH,
     decimated,
 )
-from master_node.results import STEPS_DTYPE, Result
 from protocol.errors import ResultsError
 
 

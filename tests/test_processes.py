@@ -27,9 +27,9 @@ import pytest
 import tomli_w
 
 from master_node import Result, load_system, simulate
-from master_node.cli import main
+from master_node.cli.app import main
 from protocol.errors import ResultsError
-from protocol.processes import ending_signals
+from protocol.host.processes import ending_signals
 from tests.quarter_car_case import DISPLACEMENT, EXAMPLES, global_errors
 from tests.waiting import BOUND, is_quick, wait_until
 

@@ -11,10 +11,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from master_node import progress as progress_module
-from master_node.agent_models import Sent
-from master_node.observers import Attempt, Outcome, RunEnd, RunStart, SlaveStatistics, Statistics
-from master_node.progress import ProgressBar, UploadBar, summary_table
+from master_node.cli.upload_bar import UploadBar
+from master_node.hosts.agent_models import Sent
+from master_node.observing import progress as progress_module
+from master_node.observing.observers import (
+    Attempt,
+    Outcome,
+    RunEnd,
+    RunStart,
+    SlaveStatistics,
+    Statistics,
+)
+from master_node.observing.progress import ProgressBar, summary_table
 from master_node.results import summarize
 from tests.waiting import BOUND
 
@@ -101,8 +109,8 @@ def test_a_closed_pipe_does_not_end_the_run() -> None:
     reading, writing = os.pipe()
     os.close(reading)
     code = """
-from master_node.observers import Outcome, RunEnd, RunStart, Statistics
-from master_node.progress import ProgressBar
+from master_node.observing.observers import Outcome, RunEnd, RunStart, Statistics
+from master_node.observing.progress import ProgressBar
 from tests.waiting import BOUND
 import numpy as np
 bar = ProgressBar()

@@ -18,9 +18,10 @@ import pytest
 
 import protocol
 from master_node import Result, load_system, simulate
-from protocol.calls import StepResult
+from protocol.calls import StepResult, StepStatus
+from protocol.description import StateVerdict
 from protocol.errors import FatalSlaveError, ModelError
-from protocol.slave import Slave, StateVerdict, StepStatus
+from protocol.slave import Slave
 from slave_node.loading import describe_model, load_slave
 from tests.quarter_car_case import global_errors
 from tests.trial_slaves import examine

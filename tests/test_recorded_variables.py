@@ -12,7 +12,7 @@ import tomli_w
 from typer.testing import CliRunner
 
 from master_node import Result, System, simulate
-from master_node.cli import app
+from master_node.cli.app import app
 from master_node.simulation import resume
 from protocol.errors import ConfigurationError, DoublestepError
 from tests.interrupting import Interrupt
@@ -264,7 +264,7 @@ def test_a_system_without_outputs_runs(
     what is recorded.
     """
     (tmp_path / "silent.py").write_text(
-        "from slave_node.model_slave import Model, real\n"
+        "from slave_node.python.model_slave import Model, real\n"
         "class Silent(Model):\n"
         "    states = (real('x', start=1.0),)\n"
         "    def derivatives(self, t, x, u):\n"

@@ -19,9 +19,9 @@ import psutil
 import pytest
 
 from master_node import System, load_system, simulate
-from master_node.call_log import CallLog, LoggedStep
-from master_node.restorable_slave import RestorableSlave
-from master_node.slave_link import LocalSlave, SlaveLink
+from master_node.slaves.call_log import CallLog, LoggedStep
+from master_node.slaves.link import LocalSlave, SlaveLink
+from master_node.slaves.restorable import RestorableSlave
 from protocol.calls import (
     Call,
     DeserializeState,
@@ -263,7 +263,7 @@ def test_a_slave_that_is_killed_again_and_again(tmp_path: Path) -> None:
 MORTAL = """
 import os, signal, time
 from pathlib import Path
-from slave_node.model_loading import load_model_class
+from slave_node.python.loading import load_model_class
 folder = Path(__file__).parent
 (folder / f"node {{os.getppid()}}").touch()
 if len(list(folder.glob("node *"))) in {deadly}:

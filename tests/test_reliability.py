@@ -170,7 +170,7 @@ def test_a_full_disk_ends_the_run_with_readable_results(tmp_path: Path) -> None:
         f"import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}));"
         f"sys.argv = ['master-node', 'run', {str(file)!r}, '--in-process', '--no-plot',"
         f" '--output', {str(tmp_path / 'out')!r}];"
-        "from master_node.cli import main; main()"
+        "from master_node.cli.app import main; main()"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=BOUND, check=False

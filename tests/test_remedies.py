@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 
 from master_node import System, simulate
-from master_node.configure_slaves import configure
-from master_node.preparation import Prepared, prepare
-from master_node.restorable_slave import RestorableSlave
+from master_node.coupling.step_sizes import with_fixed_steps
+from master_node.preparing.configuring import configure
+from master_node.preparing.preparation import Prepared, prepare
 from master_node.simulation import run
-from master_node.slave_group import SlaveGroup
-from master_node.slave_link import LocalSlave, SlaveLink
-from master_node.step_size_rules import with_fixed_steps
+from master_node.slaves.group import SlaveGroup
+from master_node.slaves.link import LocalSlave, SlaveLink
+from master_node.slaves.restorable import RestorableSlave
 from protocol.calls import Configure, Reply, StepResult
+from protocol.description import Examination, InputDerivatives, StateKind, StateVerdict
 from protocol.errors import (
     ConfigurationError,
     ModelError,
@@ -29,9 +30,9 @@ from protocol.errors import (
     SlaveError,
     StepSizeError,
 )
-from protocol.slave import Examination, InputDerivatives, Slave, StateKind, StateVerdict
-from slave_node.executor import Executor
-from slave_node.substeps import with_substeps
+from protocol.slave import Slave
+from slave_node.execution.executor import Executor
+from slave_node.substeps.slave import with_substeps
 from tests.quarter_car_case import (
     ALL,
     CHASSIS,

@@ -23,9 +23,10 @@ from protocol.calls import (
     SetDiscreteInputs,
     SetInputs,
     StepResult,
+    StepStatus,
 )
+from protocol.description import StateKind
 from protocol.errors import SlaveError
-from protocol.slave import StateKind, StepStatus
 from slave_node.states.call_record import CallRecord
 from slave_node.states.replay_slave import ReplaySlave
 from tests.quarter_car_case import WHEEL, LinearSlave

@@ -13,12 +13,12 @@ from contextlib import suppress
 import pytest
 import zenoh
 
-from protocol.codec import MAX_MESSAGE_BYTES
-from protocol.endpoints import Endpoints
+from protocol.bus.endpoints import Endpoints
+from protocol.bus.request_line import Line
+from protocol.bus.room import Room
+from protocol.bus.zenoh import ZenohBus
 from protocol.errors import DeadlineError, MalformedMessageError, SlaveLostError
-from protocol.request_line import Line
-from protocol.room import Room
-from protocol.zenoh_bus import ZenohBus
+from protocol.wire.packing import MAX_MESSAGE_BYTES
 from tests.waiting import BOUND, wait_until
 
 MIB = 2**20

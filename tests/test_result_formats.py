@@ -26,8 +26,8 @@ from scipy.io import loadmat, savemat
 from typer.testing import CliRunner
 
 from master_node import Result, load_system, simulate
-from master_node.cli import app, main
-from master_node.observers import (
+from master_node.cli.app import app, main
+from master_node.observing.observers import (
     Attempt,
     DiscreteValue,
     Outcome,
@@ -36,7 +36,6 @@ from master_node.observers import (
     RunStart,
     Statistics,
 )
-from master_node.patterns import chosen
 from master_node.results import (
     Recording,
     ResultsWriter,
@@ -45,6 +44,7 @@ from master_node.results import (
     parquet_file,
 )
 from master_node.results import writer as writer_module
+from master_node.system.patterns import chosen
 from protocol.errors import ConfigurationError, ResultsError
 from tests.waiting import BOUND, wait_until
 
@@ -939,7 +939,7 @@ def test_formats_are_imported_when_they_are_asked_for(tmp_path: Path) -> None:
     script = (
         "import sys\n"
         "from master_node import Result, load_system, simulate\n"
-        "import master_node.cli\n"
+        "import master_node.cli.app\n"
         "system = load_system(__import__('pathlib').Path(sys.argv[1]))\n"
         "simulate(system, in_process=True, output=sys.argv[2], stop_time=0.05)\n"
         "Result.load(sys.argv[2])\n"

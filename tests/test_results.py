@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master_node.observers import (
+from master_node.observing.observers import (
     Attempt,
     Observer,
     Outcome,

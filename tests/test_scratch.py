@@ -13,8 +13,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from protocol import scratch
-from protocol.scratch import PREFIX, ScratchDirectory
+from protocol.host import scratch
+from protocol.host.scratch import PREFIX, ScratchDirectory
 from tests.test_processes import BOUND, FOREVER, Command, has_stepped, system_file, wait_until
 
 pytestmark = [
@@ -34,7 +34,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 HOLD = """
-from protocol.scratch import ScratchDirectory
+from protocol.host.scratch import ScratchDirectory
 made = ScratchDirectory()
 (made.path / "folder").mkdir()
 (made.path / "folder" / "file").write_text("full")

@@ -22,16 +22,17 @@ import zenoh
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from master_node import load_system, remote_slave, simulate
-from protocol.access import access_control
-from protocol.administration import claim_name
-from protocol.bus import Bus
-from protocol.credentials import Credentials, Role
-from protocol.endpoints import Endpoints, Mode, free_endpoint
+from master_node import load_system, simulate
+from master_node.hosts.opening import remote as remote_slave
+from protocol.bus.access import access_control
+from protocol.bus.bus import Bus
+from protocol.bus.credentials import Credentials, Role
+from protocol.bus.endpoints import Endpoints, Mode, free_endpoint
+from protocol.bus.reachability import Reach, probe, probe_without_tls
+from protocol.bus.zenoh import ZenohBus
 from protocol.errors import ConfigurationError, InterruptedRunError, SlaveLostError
-from protocol.keys import STATUS, MasterKey, SlaveKey, alive_slaves
-from protocol.reachability import Reach, probe, probe_without_tls
-from protocol.zenoh_bus import ZenohBus
+from protocol.wire.administration import claim_name
+from protocol.wire.keys import STATUS, MasterKey, SlaveKey, alive_slaves
 from slave_node import certificates
 from slave_node.certificates import Host, make_certificates
 from tests.quarter_car_case import EXAMPLES
@@ -424,7 +425,7 @@ def test_masters_ask_slaves_and_slaves_ask_nobody(
 
 
 def test_the_rules_name_every_role_and_deny_what_they_do_not_name() -> None:
-    """The table of `protocol.access` is what Zenoh gets; publications are for nobody."""
+    """The table of `protocol.bus.access` is what Zenoh gets; publications are for nobody."""
     rules = access_control()
     assert rules["default_permission"] == "deny"
     assert {s["id"] for s in rules["subjects"]} == set(Role)

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from master_node import System, simulate
-from master_node.observers import Attempt
+from master_node.observing.observers import Attempt
 from protocol.errors import InterruptedRunError
 from slave_node.floating_point import restore_floating_point
 

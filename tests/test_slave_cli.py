@@ -20,11 +20,11 @@ import psutil
 import pytest
 from typer.testing import CliRunner
 
-from protocol.codec import decode_map
-from protocol.endpoints import Endpoints
-from protocol.keys import STATUS, SlaveKey
-from protocol.zenoh_bus import ZenohBus
-from slave_node.cli import app
+from protocol.bus.endpoints import Endpoints
+from protocol.bus.zenoh import ZenohBus
+from protocol.wire.keys import STATUS, SlaveKey
+from protocol.wire.packing import decode_map
+from slave_node.cli.app import app
 from tests.waiting import BOUND, is_quick
 
 pytestmark = [

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from master_node import load_system, simulate
-from master_node.request_bounds import RequestBounds, RequestClock
+from master_node.slaves.request_bounds import RequestBounds, RequestClock
+from protocol.bus.endpoints import free_endpoint
 from protocol.calls import (
     Call,
     Configure,
@@ -27,9 +28,8 @@ from protocol.calls import (
     Reset,
     SetState,
 )
-from protocol.endpoints import free_endpoint
+from protocol.description import SlaveDescription, StateKind
 from protocol.errors import DeadlineError, DoublestepError
-from protocol.slave import SlaveDescription, StateKind
 from tests.test_processes import Start, start
 
 __all__ = ["start"]

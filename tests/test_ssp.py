@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from master_node import open_system
-from master_node.system_files import read_ssp
+from master_node.system.files import read_ssp
 from tests.quarter_car_case import EXAMPLES
 from tests.ssp_documents import DIRECT, invoke, pairs
 

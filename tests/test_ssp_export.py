@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from master_node import System, load_system
-from master_node.ssp.writing import write_package
-from master_node.system_files import export_system, import_system, read_ssp
+from master_node.system.files import export_system, import_system, read_ssp
+from master_node.system.ssp.writing import write_package
 from protocol.errors import ConfigurationError
 from tests.quarter_car_case import EXAMPLES
 from tests.ssp_documents import (

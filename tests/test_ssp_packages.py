@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from master_node import Result, open_system, simulate
+from master_node.coupling.coupled_system import resolve
 from master_node.simulation import resume
-from master_node.system import resolve
 from protocol.errors import ConfigurationError, DoublestepError, ModelError
 from tests.ssp_documents import (
     CHASSIS,

@@ -12,10 +12,10 @@ from random import Random
 import pytest
 from lxml import etree
 
-from master_node.ssp.flattening import flatten
-from master_node.ssp.reading import read_structure
-from master_node.ssp.structure import Notes
-from master_node.system_files import read_ssp
+from master_node.system.files import read_ssp
+from master_node.system.ssp.flattening import flatten
+from master_node.system.ssp.reading import read_structure
+from master_node.system.ssp.structure import Notes
 from protocol.errors import ConfigurationError, ModelError
 from tests.ssp_documents import (
     ENTRIES,
@@ -387,7 +387,7 @@ def test_arrays_without_end_are_refused(
     packages: Packages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A few lines could stand for more connections than there is memory."""
-    monkeypatch.setattr("master_node.ssp.graph.MAX_EDGES", 100)
+    monkeypatch.setattr("master_node.system.ssp.graph.MAX_EDGES", 100)
     large = '<ssc:Float64/><ssc:Dimension size="100000"/>'
     parts = component("chassis", connector("x", "output", inner=large) + connector("v", "output"))
     parts += component("wheel", connector("x_c", "input", inner=large))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from master_node import simulate
-from master_node.ssp.structure import Linear, Table, Unit
+from master_node.system.ssp.structure import Linear, Table, Unit
 from tests.ssp_documents import (
     CHASSIS,
     DIRECT,

@@ -74,6 +74,8 @@ def test_a_run_that_warns_and_draws(tmp_path: Path) -> None:
 
 def test_what_models_print_in_their_own_process() -> None:
     """A print ends no model, with or without a buffer, and no process at its end."""
-    words = "from protocol.standard_error import forgive_models as f; f(); print('x' * 10**6); "
+    words = (
+        "from protocol.host.standard_error import forgive_models as f; f(); print('x' * 10**6); "
+    )
     assert into_full_disk("-c", f"{words} print('y', flush=True)") == 0
     assert into_full_disk("-c", "print('x' * 10**6)") != 0

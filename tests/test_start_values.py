@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from master_node.start_values import start_values
+from master_node.system.start_values import start_values
+from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError
-from protocol.slave import SlaveDescription, Variable, VariableType
+from protocol.variables import Variable, VariableType
 
 DESCRIPTION = SlaveDescription(
     "test",

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from master_node import System, load_system, simulate
-from master_node.cli import main
-from master_node.configure_slaves import configure
-from master_node.slave_link import LocalSlave
+from master_node.cli.app import main
+from master_node.preparing.configuring import configure
+from master_node.slaves.link import LocalSlave
 from protocol.calls import Configure, Describe
+from protocol.description import SlaveDescription, StateKind
 from protocol.errors import ModelError, SlaveError
-from protocol.slave import SlaveDescription, StateKind
-from slave_node.executor import Executor
+from slave_node.execution.executor import Executor
 from slave_node.loading import describe_model, load_executor
 from slave_node.states.ladder import choose
 from tests.quarter_car_case import CHASSIS, DISPLACEMENT, EXAMPLES, WHEEL, car, run_slaves

@@ -14,16 +14,17 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System
+from master_node.coupling.step_sizes import check_step_sizes
 from master_node.numerics.double_step_times import step_end
 from master_node.numerics.step_size_limits import (
     SlaveLimits,
     StepSizeLimits,
     StepSizeLimitsError,
 )
-from master_node.step_size_rules import check_step_sizes
 from protocol.calls import StepResult
+from protocol.description import Capabilities, StateKind
 from protocol.errors import ConfigurationError, StepSizeError
-from protocol.slave import Capabilities, Slave, StateKind
+from protocol.slave import Slave
 from tests.quarter_car_case import (
     ALL,
     CHASSIS,

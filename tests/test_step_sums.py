@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from master_node import System, simulate
 from protocol.calls import StepResult
-from protocol.slave import Capabilities
+from protocol.description import Capabilities
 from protocol.step_sums import step_to
 from tests.quarter_car_case import ALL, CHASSIS, DISPLACEMENT, WHEEL, LinearSlave, Run, run_slaves
 from tests.test_resume import contents, interrupted

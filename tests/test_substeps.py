@@ -16,13 +16,14 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
 from master_node import simulate
-from protocol.calls import Configure, StepResult
+from protocol.calls import Configure, StepResult, StepStatus
+from protocol.description import InputDerivatives
 from protocol.errors import SlaveError, StepRejectedError
-from protocol.slave import InputDerivatives, Slave, StepStatus
+from protocol.slave import Slave
 from protocol.step_sums import step_to
 from slave_node.loading import describe_model, load_slave
-from slave_node.substep_inputs import MAX_SUBSTEPS, scaled, substep_values, substeps_needed
-from slave_node.substeps import SubstepSlave, with_substeps
+from slave_node.substeps.inputs import MAX_SUBSTEPS, scaled, substep_values, substeps_needed
+from slave_node.substeps.slave import SubstepSlave, with_substeps
 from tests.quarter_car_case import ALL, CHASSIS, CHASSIS_FORCE, WHEEL_FORCE, car, global_errors
 from tests.trial_slaves import BoundedSlave, TimedSlave, described
 

@@ -15,18 +15,18 @@ import msgpack
 import pytest
 from rich.console import Console
 
-from master_node.doctor import diagnose
-from master_node.listing import listing_data, listing_tables
-from master_node.survey import Participant, measure, survey
-from master_node.windows import Window
-from protocol.administration import MasterStatus, RouterStatus, SlaveStatus
-from protocol.bus import Bus, InProcessBus
-from protocol.codec import PROTOCOL_VERSION, decode_map, encode_map
-from protocol.credentials import Role
-from protocol.endpoints import Endpoints
+from master_node.survey.doctor import diagnose
+from master_node.survey.listing import listing_data, listing_tables
+from master_node.survey.participants import Participant, measure, survey
+from master_node.survey.windows import Window
+from protocol.bus.bus import Bus, InProcessBus
+from protocol.bus.credentials import Role
+from protocol.bus.endpoints import Endpoints
+from protocol.bus.zenoh import ZenohBus
 from protocol.errors import MalformedMessageError
-from protocol.keys import STATUS, MasterKey, RouterKey, SlaveKey
-from protocol.zenoh_bus import ZenohBus
+from protocol.wire.administration import MasterStatus, RouterStatus, SlaveStatus
+from protocol.wire.keys import STATUS, MasterKey, RouterKey, SlaveKey
+from protocol.wire.packing import PROTOCOL_VERSION, decode_map, encode_map
 from slave_node.certificates import Host, make_certificates
 from tests.quarter_car_case import EXAMPLES
 from tests.test_network import Commands

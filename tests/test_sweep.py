@@ -36,7 +36,7 @@ from master_node.study.directory import StudyDirectory
 from master_node.study.plan import PlannedRun, make_plan
 from master_node.study.records import RunRecord, read_record, write_record
 from protocol.errors import ConfigurationError, ResultsError
-from protocol.processes import ending_signals
+from protocol.host.processes import ending_signals
 from tests.quarter_car_case import DISPLACEMENT, EXAMPLES
 from tests.waiting import BOUND, is_quick, wait_until
 
@@ -430,7 +430,7 @@ def invoke(*words: object) -> Done:
     """``master-node`` with these words, in this process."""
     from typer.testing import CliRunner  # noqa: PLC0415  here only
 
-    from master_node.cli import app  # noqa: PLC0415
+    from master_node.cli.app import app  # noqa: PLC0415
     from protocol.errors import DoublestepError  # noqa: PLC0415
 
     kept = {number: signal.getsignal(number) for number in ending_signals()}

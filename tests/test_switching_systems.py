@@ -11,14 +11,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from master_node import Result, System
-from master_node.configure_slaves import configure
-from master_node.observers import Statistics
-from master_node.preparation import prepare
-from master_node.run_warnings import warnings_of
-from master_node.slave_group import SlaveGroup
-from master_node.slave_link import LocalSlave, SlaveLink
+from master_node.observing.observers import Statistics
+from master_node.observing.run_warnings import warnings_of
+from master_node.preparing.configuring import configure
+from master_node.preparing.preparation import prepare
+from master_node.slaves.group import SlaveGroup
+from master_node.slaves.link import LocalSlave, SlaveLink
 from protocol.slave import Slave
-from slave_node.executor import Executor
+from slave_node.execution.executor import Executor
 from tests.jump_models import Cosine, LimitedController, Product, PulseTrains, Threshold
 from tests.quarter_car_case import run_slaves
 

@@ -13,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master_node import System
-from master_node.system import CoupledSystem, resolve
+from master_node.coupling.coupled_system import CoupledSystem, resolve
+from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError
-from protocol.slave import Causality, SlaveDescription, Unit, Variable, VariableType
+from protocol.variables import Causality, Unit, Variable, VariableType
 from tests.quarter_car_case import STATES, car, load_slave
 
 INPUT, OUTPUT, LOCAL = Causality.INPUT, Causality.OUTPUT, Causality.LOCAL

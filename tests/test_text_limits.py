@@ -9,14 +9,25 @@ from typing import Any
 
 import pytest
 
-from master_node.remote_slave import RemoteSlave
-from master_node.request_bounds import RequestBounds
-from master_node.survey import survey
-from protocol import codec
-from protocol.administration import Claim, Claimed, MasterStatus, RouterStatus
-from protocol.bus import InProcessBus
+from master_node.slaves.remote import RemoteSlave
+from master_node.slaves.request_bounds import RequestBounds
+from master_node.survey.participants import survey
+from protocol.bus.bus import InProcessBus
 from protocol.calls import Describe, Examine, Initialize, Reply
-from protocol.codec import (
+from protocol.description import Examination, SlaveDescription
+from protocol.errors import (
+    ConfigurationError,
+    DoublestepError,
+    MalformedMessageError,
+    ModelError,
+    SlaveError,
+)
+from protocol.text.limits import MAX_HOST, MAX_NAME, MAX_SENTENCE, cut
+from protocol.variables import Variable
+from protocol.wire import packing as codec
+from protocol.wire.administration import Claim, Claimed, MasterStatus, RouterStatus
+from protocol.wire.keys import CLAIM, STATUS, AgentKey, MasterKey, RouterKey, SlaveKey
+from protocol.wire.packing import (
     MAX_FIELDS,
     MAX_MESSAGE_BYTES,
     decode_map,
@@ -26,17 +37,7 @@ from protocol.codec import (
     encode_reply,
     encode_single_reply,
 )
-from protocol.errors import (
-    ConfigurationError,
-    DoublestepError,
-    MalformedMessageError,
-    ModelError,
-    SlaveError,
-)
-from protocol.keys import CLAIM, STATUS, AgentKey, MasterKey, RouterKey, SlaveKey
-from protocol.slave import Examination, SlaveDescription, Variable
-from protocol.text_limits import MAX_HOST, MAX_NAME, MAX_SENTENCE, cut
-from slave_node.node import SlaveNode
+from slave_node.serving.node import SlaveNode
 from tests.light_slaves import LightWorker
 from tests.test_survey import slave_status
 

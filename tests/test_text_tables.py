@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master_node import System, simulate
-from master_node.text_tables import TextTable, read_text_table
+from master_node.inputs.text_tables import TextTable, read_text_table
 from protocol.errors import ConfigurationError
-from protocol.slave import Unit
+from protocol.variables import Unit
 from tests.quarter_car_case import LinearSlave, LinearSystem, run_slaves
 
 numbers = st.one_of(st.floats(allow_nan=False, allow_infinity=False), st.integers(-99, 99))

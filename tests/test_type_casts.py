@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from master_node.type_casts import cast, mapped_cast
-from protocol.slave import Variable, VariableType
+from master_node.coupling.type_casts import cast, mapped_cast
+from protocol.variables import Variable, VariableType
 
 INTEGERS = [kind for kind in VariableType if kind.integer_range is not None]
 REALS = [kind for kind in VariableType if kind.is_real]

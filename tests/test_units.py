@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master_node.units import IDENTITY, UnitMismatchError, UnknownUnitError, conversion
-from protocol.slave import Unit
+from master_node.coupling.units import IDENTITY, UnitMismatchError, UnknownUnitError, conversion
+from protocol.variables import Unit
 
 LENGTH = (0, 1, 0, 0, 0, 0, 0, 0)
 TEMPERATURE = (0, 0, 0, 0, 1, 0, 0, 0)

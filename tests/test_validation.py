@@ -14,16 +14,18 @@ import pytest
 from fmpy import read_model_description
 from rich.console import Console
 
-from protocol.slave import CallExecutor, SlaveDescription, Variable
-from slave_node.inspection import description_tables, report_table
+from protocol.description import SlaveDescription
+from protocol.slave import CallExecutor
+from protocol.variables import Variable
 from slave_node.loading import load_executor
-from slave_node.validation import Finding, Grade, validate
-from slave_node.worker import ModelReference, WorkerProcess, execute_program
+from slave_node.validation.report import description_tables, report_table
+from slave_node.validation.trials import Finding, Grade, validate
+from slave_node.worker.process import ModelReference, WorkerProcess, execute_program
 from tests.waiting import BOUND
 
 
 class LocalWorker:
-    """Implements `slave_node.worker.Worker` in this process: nothing to start, nothing to kill."""
+    """Implements `Worker` of `slave_node.worker.process` in this process: nothing to kill."""
 
     def __init__(self, reference: ModelReference) -> None:
         self._reference = reference

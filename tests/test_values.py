@@ -18,16 +18,16 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from master_node import Result, System, load_system, simulate
-from master_node.cli import app
+from master_node.cli.app import app
 from master_node.study.case import apply_case
 from master_node.study.configuration import load_study
 from master_node.study.plan import make_plan
-from master_node.system_files import open_system
+from master_node.system.files import open_system
 from protocol.errors import ConfigurationError
-from protocol.slave import Variable, VariableType
-from protocol.toml_text import assigned_values
+from protocol.host.toml_text import assigned_values
 from protocol.values import BoundsError, checked_value, parsed, value_of
-from slave_node.given_parameters import check_parameters
+from protocol.variables import Variable, VariableType
+from slave_node.serving.given_parameters import check_parameters
 from tests.ssp_documents import binding, bindings, component, described, real, ssd, system
 
 ITEMS = {"reverse": -1, "neutral": 0, "forward": 1, "fast": 5}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.python_processes import python_command, restore_path, safe_path
+from protocol.host.python_processes import python_command, restore_path, safe_path
 from tests.quarter_car_case import EXAMPLES
 
 pytestmark = [

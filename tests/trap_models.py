@@ -8,9 +8,9 @@ from pathlib import Path
 from time import sleep
 from typing import Any
 
-from protocol.slave import Variable, VariableType
+from protocol.variables import Variable, VariableType
 from slave_node.model import real
-from slave_node.model_loading import load_model_class
+from slave_node.python.loading import load_model_class
 
 _EXAMPLES = Path(__file__).parents[1] / "examples" / "quarter_car"
 _Chassis: Any = load_model_class("quarter_car.py:Chassis", _EXAMPLES)

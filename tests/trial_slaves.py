@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from protocol.calls import Examine, StepResult
+from protocol.calls import Examine, StepResult, StepStatus
+from protocol.description import Examination
 from protocol.errors import SlaveError, StepRejectedError
-from protocol.slave import Examination, Slave, StepStatus
-from slave_node import examination
+from protocol.slave import Slave
+from slave_node.execution import examination
 from tests.quarter_car_case import CHASSIS, LinearSlave, LinearSystem
 
 

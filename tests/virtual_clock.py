@@ -31,12 +31,12 @@ class VirtualTimer:
     is_cancelled = False
 
     def cancel(self) -> None:
-        """See `protocol.clock.Timer`."""
+        """See `protocol.host.clock.Timer`."""
         self.is_cancelled = True
 
 
 class VirtualClock:
-    """Implements `protocol.clock.Clock`. Only tasks, that is what `run` runs, may wait."""
+    """Implements `protocol.host.clock.Clock`. Only tasks, that is what `run` runs, may wait."""
 
     def __init__(self) -> None:
         self._now = 0.0

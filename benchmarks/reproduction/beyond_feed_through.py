@@ -19,8 +19,8 @@ from benchmarks.reproduction.beyond_text import (
 from benchmarks.reproduction.local_errors import ExactStarts
 from benchmarks.reproduction.measured_runs import FORCE, Run, load, run_variant, varied
 from master_node import System
+from master_node.hosts.opening import slaves_in_process
 from master_node.numerics.extrapolation import InputPolynomial
-from master_node.slaves import slaves_in_process
 
 FOLLOWS = {"wheel": {"outputs_follow_inputs": True}}
 STATES = ("chassis.x", "chassis.v")

@@ -15,16 +15,16 @@ import numpy as np
 
 from benchmarks.reproduction.exact_quarter_car import FloatArray, outputs, slopes, states
 from master_node import System
-from master_node.coupling_scheme import CouplingScheme
-from master_node.double_step import DoubleStep, DoubleStepper
-from master_node.error_control import ErrorControl
-from master_node.initialization import initialize
+from master_node.coupling.coupled_system import resolve
+from master_node.coupling.scheme import CouplingScheme
+from master_node.hosts.opening import Slaves, slaves_in_process
+from master_node.judging.comparison import ErrorControl
 from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import ESTIMATORS
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
-from master_node.slave_group import SlaveGroup
-from master_node.slaves import Slaves, slaves_in_process
-from master_node.system import resolve
+from master_node.preparing.initialization import initialize
+from master_node.slaves.group import SlaveGroup
+from master_node.stepping.double_step import DoubleStep, DoubleStepper
 from protocol.calls import Reset
 
 SLAVE_TOLERANCE = 1e-13

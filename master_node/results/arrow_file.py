@@ -18,7 +18,7 @@ from typing import Any, Self
 import numpy as np
 import pyarrow as pa
 
-from master_node.observers import DiscreteType, DiscreteValue, Point
+from master_node.observing.observers import DiscreteType, DiscreteValue, Point
 from master_node.results.columns import DTYPES, Columns, Table
 from master_node.results.files import BatchFile, cannot_read, malformed, replacing
 from protocol.errors import ResultsError

@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from master_node.observers import DiscreteType, DiscreteValue, RunStart
+from master_node.observing.observers import DiscreteType, DiscreteValue, RunStart
 from protocol.signals import FloatArray
 
 DiscreteArray = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_] | NDArray[np.object_]

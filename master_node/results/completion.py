@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from master_node.observers import Outcome
+from master_node.observing.observers import Outcome
 from master_node.results.files import (
     ARROW_FILE,
     CHECKPOINT_FOLDER,

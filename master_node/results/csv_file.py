@@ -16,7 +16,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from master_node.observers import DiscreteType, Point
+from master_node.observing.observers import DiscreteType, Point
 from master_node.results.columns import NOTHING_KNOWN, Columns, Known, Table
 from master_node.results.files import LineFile, cannot_read, malformed, one_field
 

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from protocol.directory_locks import lock_directory
 from protocol.errors import ResultsError
+from protocol.host.directory_locks import lock_directory
 
 
 @contextmanager

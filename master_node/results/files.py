@@ -10,9 +10,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from master_node.observers import Point
+from master_node.observing.observers import Point
 from protocol.errors import ResultsError
-from protocol.new_files import open_new, open_old
+from protocol.host.new_files import open_new, open_old
 
 RESULTS_FILE = "results.csv"
 ARROW_FILE = "results.arrow"

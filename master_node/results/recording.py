@@ -5,7 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Mapping
 
-from master_node.observers import Attempt, DiscreteValue, Points, RunEnd, RunStart
+from master_node.observing.observers import Attempt, DiscreteValue, Points, RunEnd, RunStart
 from master_node.results.columns import Columns, Table
 from master_node.results.result import Result
 from master_node.results.steps_file import Steps

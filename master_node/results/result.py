@@ -150,7 +150,7 @@ class Result:
             ResultsError: the file cannot be written.
         """
         # matplotlib takes half a second to import, which a run without a plot need not pay
-        from master_node.plots import plot_result  # noqa: PLC0415
+        from master_node.results.plots import plot_result  # noqa: PLC0415
 
         return plot_result(self, None if path is None else Path(path), show, variables)
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from master_node.observers import Attempt, Observer, Point, RunEnd, RunStart
-from master_node.patterns import chosen, is_name, matches
+from master_node.observing.observers import Attempt, Observer, Point, RunEnd, RunStart
+from master_node.system.patterns import chosen, is_name, matches
 from protocol.errors import ConfigurationError
-from protocol.names import nearest
+from protocol.text.names import nearest
 
 
 def check_variables(

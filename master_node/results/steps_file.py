@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from master_node.observers import Attempt
+from master_node.observing.observers import Attempt
 from master_node.results.csv_file import finished, opened
 from master_node.results.files import LineFile, cannot_read, malformed, one_field
 

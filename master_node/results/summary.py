@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from master_node.observers import RunEnd, RunStart
+from master_node.observing.observers import RunEnd, RunStart
+from master_node.observing.run_warnings import warnings_of
 from master_node.results.columns import Columns
 from master_node.results.files import cannot_read, cannot_write, malformed, replacing
-from master_node.run_warnings import warnings_of
 
 
 def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> dict[str, Any]:

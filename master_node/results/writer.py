@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from time import monotonic
 
-from master_node.observers import Attempt, Point, Points, RunEnd, RunStart
+from master_node.observing.observers import Attempt, Point, Points, RunEnd, RunStart
 from master_node.results.columns import Columns
 from master_node.results.completion import (
     complete,
@@ -44,7 +44,7 @@ from master_node.results.summary import (
     write_json,
 )
 from protocol.errors import ResultsError
-from protocol.new_files import remove_folder
+from protocol.host.new_files import remove_folder
 
 FLUSH_INTERVAL = 0.5
 """Shortest time between two writes [s]: what a killed master loses at most of a fast run."""

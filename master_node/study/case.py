@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tomli_w
 
-from master_node.configuration import Scalar, System
-from master_node.toml_files import read_tables
+from master_node.system.system import Scalar, System
+from master_node.system.toml_files import read_tables
 from protocol.errors import ConfigurationError
 
 Case = Mapping[str, Scalar]

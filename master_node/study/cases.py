@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from master_node.configuration import Scalar
 from master_node.numerics.samples import latin_hypercube, spaced
 from master_node.study.case import Case
 from master_node.study.configuration import (
@@ -21,8 +20,9 @@ from master_node.study.configuration import (
     Sample,
     Study,
 )
+from master_node.system.system import Scalar
 from protocol.errors import ConfigurationError
-from protocol.toml_text import toml_value
+from protocol.host.toml_text import toml_value
 
 _MOST_RATIOS = 64
 """More equal ratios do not lie between two different integers of 64 bits."""

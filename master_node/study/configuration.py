@@ -24,12 +24,12 @@ from pydantic import (
     model_validator,
 )
 
-from master_node.configuration import Number, Positive, Reference, Scalar, configuration_error
 from master_node.numerics.reductions import REDUCTIONS
-from master_node.toml_files import read_located_tables
+from master_node.system.system import Number, Positive, Reference, Scalar, configuration_error
+from master_node.system.toml_files import read_located_tables
 from protocol.errors import ConfigurationError
-from protocol.keys import check_name
-from protocol.names import nearest
+from protocol.text.names import nearest
+from protocol.wire.keys import check_name
 
 MAX_RUNS = 100_000
 """More runs than this are taken for a mistake."""

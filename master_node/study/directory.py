@@ -25,7 +25,7 @@ from typing import BinaryIO, Self
 from master_node.study.plan import Plan, PlannedRun
 from master_node.study.records import RECORD_FILE, RunRecord, read_record
 from protocol.errors import ResultsError
-from protocol.new_files import open_old, own_folder
+from protocol.host.new_files import open_old, own_folder
 
 TABLE_FILE = "study.csv"
 LOCK_FILE = "study.lock"

@@ -8,23 +8,24 @@ from functools import cache
 from importlib.metadata import entry_points, version
 from typing import Any
 
-from master_node.configuration import InputSettings, System
-from master_node.input_loading import load_signals
+from master_node.coupling.coupled_system import CoupledSystem, resolve
+from master_node.coupling.step_sizes import check_step_sizes, with_fixed_steps
+from master_node.inputs.loading import load_signals
 from master_node.numerics.reductions import REDUCTIONS_OF_VALUES
-from master_node.patterns import chosen
 from master_node.results.selection import check_variables
 from master_node.results.summary import settings_sha256
 from master_node.simulation import settings_of
-from master_node.step_size_rules import check_step_sizes, with_fixed_steps
 from master_node.study.case import Case, apply_case
 from master_node.study.cases import cases_of
 from master_node.study.configuration import Study
-from master_node.system import CoupledSystem, resolve
-from master_node.system_files import open_system
+from master_node.system.files import open_system
+from master_node.system.patterns import chosen
+from master_node.system.system import InputSettings, System
+from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError, DoublestepError
-from protocol.files import file_sha256
-from protocol.names import nearest
-from protocol.slave import SlaveDescription, VariableType
+from protocol.host.files import file_sha256
+from protocol.text.names import nearest
+from protocol.variables import VariableType
 
 _NO_INFLUENCE = ("bus", "system_file")
 """Settings that change nothing in the results of a run."""

@@ -17,10 +17,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from master_node.progress import UPDATE_INTERVAL
+from master_node.observing.progress import UPDATE_INTERVAL
 from master_node.study.directory import run_name
 from master_node.study.records import RunRecord
-from protocol.tables import StandardError, plain
+from protocol.host.tables import StandardError, plain
 
 
 class StudyProgress:

@@ -15,8 +15,8 @@ from master_node.study.case import Case, write_case
 from master_node.study.directory import put_in_place
 from master_node.study.records import CASE_FILE, LOG_FILE, RunRecord, write_record
 from protocol.errors import DeadlineError, ResultsError
-from protocol.python_processes import python_command
-from protocol.scratch import ScratchDirectory
+from protocol.host.python_processes import python_command
+from protocol.host.scratch import ScratchDirectory
 
 END_TIME = 0.2
 """How long an interrupted run has to end by itself [s]; nothing that it wrote is kept."""

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from master_node.configuration import Scalar
 from master_node.numerics.reductions import REDUCTIONS
 from master_node.results import Result
 from master_node.results.files import replacing
@@ -17,6 +16,7 @@ from master_node.study.configuration import ReducedOutput
 from master_node.study.directory import run_name
 from master_node.study.plan import Plan, PlannedRun
 from master_node.study.records import RunRecord
+from master_node.system.system import Scalar
 from protocol.errors import ConfigurationError, ResultsError
 
 Cell = Scalar | None

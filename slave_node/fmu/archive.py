@@ -9,9 +9,9 @@ from pathlib import Path, PurePosixPath
 
 from fmpy import platform, platform_tuple, sharedLibraryExtension
 
-from protocol.archives import MAX_XML_BYTES, check_xml, checked_archive, read_entry
 from protocol.errors import ModelError
-from protocol.files import DESCRIPTION, entry_names
+from protocol.host.archives import MAX_XML_BYTES, check_xml, checked_archive, read_entry
+from protocol.host.files import DESCRIPTION, entry_names
 
 PLATFORM_FOLDERS = (str(platform), str(platform_tuple))
 """Names of this platform under ``binaries``: until FMI 2.0, since FMI 3.0."""

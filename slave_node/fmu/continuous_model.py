@@ -13,7 +13,7 @@ from fmpy.fmi3 import FMU3Model
 
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
-from protocol.slave import StartValue
+from protocol.variables import StartValue
 from slave_node.fmu.exchange import Buffer
 from slave_node.fmu.fmi2 import Fmi2Instance
 from slave_node.fmu.fmi3 import MAX_UPDATES, Fmi3Instance

@@ -11,10 +11,11 @@ from xml.etree.ElementTree import Element
 
 from fmpy import read_model_description
 
+from protocol.description import SlaveDescription, StateKind
 from protocol.errors import ModelError
-from protocol.files import DESCRIPTION, Contents
-from protocol.scratch import ScratchDirectory
-from protocol.slave import Causality, SlaveDescription, StartValue, StateKind, VariableType
+from protocol.host.files import DESCRIPTION, Contents
+from protocol.host.scratch import ScratchDirectory
+from protocol.variables import Causality, StartValue, VariableType
 from slave_node.fmu.archive import extract
 from slave_node.fmu.embedded_python import log_categories, slave_module
 from slave_node.fmu.interfaces import (

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.signals import MAX_ORDER, FloatArray, InputSignal
-from protocol.slave import VariableType
+from protocol.variables import VariableType
 from slave_node.fmu.variables import Place
 
 VALUES_CALL = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p]

@@ -21,10 +21,10 @@ from fmpy.fmi1 import (
     fmi1CallbackFunctions,
 )
 
-from protocol.calls import RecordedValues, StepResult
+from protocol.calls import RecordedValues, StepResult, StepStatus
 from protocol.errors import StepRejectedError
 from protocol.signals import FloatArray
-from protocol.slave import StartValue, StepStatus, VariableType
+from protocol.variables import StartValue, VariableType
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer

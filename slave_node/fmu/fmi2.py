@@ -15,9 +15,9 @@ from fmpy.fmi2 import (
     fmi2CallbackFunctions,
 )
 
-from protocol.calls import StepResult
+from protocol.calls import StepResult, StepStatus
 from protocol.errors import StepRejectedError
-from protocol.slave import StartValue, StepStatus, VariableType
+from protocol.variables import StartValue, VariableType
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer

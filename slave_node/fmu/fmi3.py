@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 from fmpy.fmi3 import FMU3Slave
 
-from protocol.calls import StepResult
+from protocol.calls import StepResult, StepStatus
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
-from protocol.slave import StartValue, StepStatus, VariableType
 from protocol.step_sums import step_to
+from protocol.variables import StartValue, VariableType
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.archive import PLATFORM_FOLDERS
 from slave_node.fmu.description import FmuModel

@@ -10,9 +10,11 @@ import ctypes
 from collections.abc import Sequence
 
 from protocol.calls import RecordedValues
+from protocol.description import SlaveDescription
 from protocol.errors import SlaveError
 from protocol.signals import MAX_ORDER, FloatArray
-from protocol.slave import Slave, SlaveDescription, StartValue
+from protocol.slave import Slave
+from protocol.variables import StartValue
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.exchange import Buffer
 from slave_node.fmu.instance import FmuInstance

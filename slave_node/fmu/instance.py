@@ -18,9 +18,9 @@ import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from protocol.errors import FatalSlaveError, ModelError, SlaveError
-from protocol.names import nearest
-from protocol.slave import StartValue, Variable, VariableType
+from protocol.text.names import nearest
 from protocol.values import value_of
+from protocol.variables import StartValue, Variable, VariableType
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.archive import PLATFORM_FOLDERS, check_binary
 from slave_node.fmu.description import FmuModel

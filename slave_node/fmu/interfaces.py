@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 from xml.etree.ElementTree import Element
 
+from protocol.description import Capabilities, InputDerivatives
 from protocol.errors import ModelError
-from protocol.slave import Capabilities, InputDerivatives
 
 _YES = ("true", "1")
 

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from protocol.errors import ModelError
-from protocol.slave import Slave, StartValue
+from protocol.slave import Slave
+from protocol.variables import StartValue
 from slave_node.fmu.description import FmuModel, read_fmu
 from slave_node.fmu.fmi1 import Fmi1Slave
 from slave_node.fmu.fmi2 import Fmi2Slave

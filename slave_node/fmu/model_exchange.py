@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from protocol.calls import StepResult
+from protocol.calls import StepResult, StepStatus
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
-from protocol.slave import Slave, StartValue, StepStatus
+from protocol.slave import Slave
+from protocol.variables import StartValue
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.continuous_model import ContinuousModel, Fmi2Model, Fmi3Model
 from slave_node.fmu.cvode import CVode, Outcome

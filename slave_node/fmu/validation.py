@@ -8,7 +8,7 @@ from typing import NamedTuple
 from fmpy import read_model_description
 from fmpy.model_description import ValidationError
 
-from protocol.scratch import ScratchDirectory
+from protocol.host.scratch import ScratchDirectory
 from slave_node.fmu.archive import extract
 
 MAX_NAMES = 1000

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from protocol.errors import ConfigurationError, SlaveError
-from protocol.slave import StartValue, VariableType
+from protocol.variables import StartValue, VariableType
 from slave_node.fmu.variables import Place
 
 

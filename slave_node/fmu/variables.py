@@ -9,9 +9,10 @@ from math import prod
 from typing import Any
 from xml.etree.ElementTree import Element
 
+from protocol.description import SlaveDescription
 from protocol.errors import ModelError
-from protocol.names import nearest
-from protocol.slave import Causality, SlaveDescription, StartValue, Variable, VariableType
+from protocol.text.names import nearest
+from protocol.variables import Causality, StartValue, Variable, VariableType
 
 MAX_VARIABLES = 100_000
 """Scalar variables of one FMU; a description with more is not sent around."""

@@ -24,10 +24,10 @@ from protocol.calls import (
     SetDiscreteInputs,
     SetInputs,
 )
-from protocol.codec import decode_program, encode_program
 from protocol.errors import DoublestepError, SlaveError
 from protocol.signals import MAX_ORDER
-from protocol.slave import StartValue
+from protocol.variables import StartValue
+from protocol.wire.packing import decode_program, encode_program
 
 _MAGIC = b"2StepRec"
 _VERSION = 1

@@ -13,8 +13,8 @@ from contextlib import suppress
 from time import monotonic
 
 from protocol.errors import HostLimitError, SlaveKilledError
-from protocol.python_processes import python_command
-from protocol.threads import LIMITS
+from protocol.host.python_processes import python_command
+from protocol.host.threads import LIMITS
 from slave_node.states.channel import PROCESS, Channel
 from slave_node.states.fork_keeper import OBITUARY
 from slave_node.states.repeating import RepeatingPart

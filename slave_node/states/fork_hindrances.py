@@ -13,8 +13,8 @@ from collections.abc import Set as AbstractSet
 from fcntl import F_GETFL, fcntl
 from pathlib import Path
 
-from protocol.descriptors import is_open
 from protocol.errors import SlaveError
+from protocol.host.descriptors import is_open
 
 _TASKS = "/proc/self/task"
 _DESCRIPTORS = "/proc/self/fd"

@@ -18,12 +18,12 @@ from time import perf_counter
 from typing import NoReturn
 
 from protocol.calls import Configure, Reply
-from protocol.codec import decode_map, decode_program, encode_error, encode_reply
 from protocol.errors import DoublestepError, SlaveError
+from protocol.host.standard_error import forgive_models
 from protocol.slave import CallExecutor, Slave
-from protocol.standard_error import forgive_models
-from slave_node.executor import Executor
-from slave_node.loading import load_model
+from protocol.wire.packing import decode_map, decode_program, encode_error, encode_reply
+from slave_node.execution.executor import Executor
+from slave_node.models import load_model
 from slave_node.states.channel import DURATION, PROCESS, Channel, Message
 from slave_node.states.fork_hindrances import ForkHindrances, reopen
 from slave_node.states.fork_keeper import report

@@ -63,7 +63,7 @@ def _hold(channel: int, obituaries: int) -> None:
         hold(socket.socket(fileno=channel), obituaries)
     except Exception:
         traceback.print_exc()
-        from slave_node.deaths import OWN_FAILURE  # noqa: PLC0415  as above
+        from slave_node.execution.exit_codes import OWN_FAILURE  # noqa: PLC0415  as above
 
         exit_code = OWN_FAILURE
     finally:

@@ -36,7 +36,7 @@ from protocol.calls import (
     StepResult,
     Terminate,
 )
-from protocol.codec import decode_reply, encode_map, encode_program
+from protocol.description import SlaveDescription, StateKind
 from protocol.errors import (
     FatalSlaveError,
     SlaveCrashedError,
@@ -45,7 +45,9 @@ from protocol.errors import (
     StepRejectedError,
 )
 from protocol.signals import FloatArray
-from protocol.slave import Slave, SlaveDescription, StartValue, StateKind
+from protocol.slave import Slave
+from protocol.variables import StartValue
+from protocol.wire.packing import decode_reply, encode_map, encode_program
 from slave_node.states.channel import DURATION, Message
 from slave_node.states.fork_family import HolderFamily
 from slave_node.states.fork_habits import Event, Habits, Situation

@@ -5,9 +5,9 @@ from __future__ import annotations
 import socket
 from collections import deque
 
-from protocol.codec import decode_reply
 from protocol.errors import DoublestepError, SlaveCrashedError, SlaveError, SlaveKilledError
-from slave_node.deaths import death, how_ended
+from protocol.wire.packing import decode_reply
+from slave_node.execution.exit_codes import death, how_ended
 from slave_node.states.channel import DURATION, PROCESS, Message
 from slave_node.states.fork_family import HolderFamily
 from slave_node.states.fork_trail import Task, Trail

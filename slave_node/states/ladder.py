@@ -10,9 +10,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+from protocol.description import SlaveDescription, StateKind
 from protocol.errors import ModelError
-from protocol.names import nearest
-from protocol.slave import Slave, SlaveDescription, StateKind
+from protocol.slave import Slave
+from protocol.text.names import nearest
 from slave_node.states.replay_slave import ReplaySlave
 from slave_node.states.stateless_slave import StatelessSlave
 

@@ -24,11 +24,14 @@ from protocol.calls import (
     SetDiscreteInputs,
     SetInputs,
     StepResult,
+    StepStatus,
 )
+from protocol.description import StateKind
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
-from protocol.slave import Slave, StartValue, StateKind, StepStatus
-from slave_node.executor import Executor
+from protocol.slave import Slave
+from protocol.variables import StartValue
+from slave_node.execution.executor import Executor
 from slave_node.states.call_record import CallRecord
 
 REMARK = "a restored state is computed anew from the start time: its cost grows with the time"

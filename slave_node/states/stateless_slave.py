@@ -7,9 +7,11 @@ from dataclasses import replace
 from typing import NoReturn
 
 from protocol.calls import RecordedValues, StepResult
+from protocol.description import StateKind
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
-from protocol.slave import Slave, StartValue, StateKind
+from protocol.slave import Slave
+from protocol.variables import StartValue
 
 
 class StatelessSlave(Slave):

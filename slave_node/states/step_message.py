@@ -11,10 +11,10 @@ from struct import Struct
 
 import numpy as np
 
-from protocol.calls import DoStep, GetOutputs, SetInputs, StepResult
+from protocol.calls import DoStep, GetOutputs, SetInputs, StepResult, StepStatus
 from protocol.errors import DoublestepError, SlaveError
 from protocol.signals import FloatArray
-from protocol.slave import Slave, StepStatus
+from protocol.slave import Slave
 
 _STEP = Struct("<dd?bb5x")  # communication point, step size, no_set_state_prior, rows, order
 _RESULT = Struct("<bd")  # status, time

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from protocol.description import StateKind, StateVerdict
 from protocol.errors import SlaveError
-from protocol.slave import StateKind, StateVerdict
 from slave_node.trials.steps import Place, Reading, Trial, TrialError, freed
 
 GOES_BACK = (StateVerdict.EXACT, StateVerdict.RESTARTS_SOLVER)

@@ -11,7 +11,7 @@ from math import log
 
 import numpy as np
 
-from protocol.slave import SUBSTEP_ERROR
+from protocol.description import SUBSTEP_ERROR
 from slave_node.trials.clock import SlowError
 from slave_node.trials.steps import Place, Reading, TrialError
 

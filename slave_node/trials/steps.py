@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.calls import Examine, SetInputs
+from protocol.calls import Examine, SetInputs, StepStatus
+from protocol.description import InputDerivatives
 from protocol.errors import FatalSlaveError, SlaveError
 from protocol.signals import FloatArray
-from protocol.slave import Causality, InputDerivatives, Slave, StartValue, StepStatus
+from protocol.slave import Slave
+from protocol.variables import Causality, StartValue
 
 TIME = 10.0
 """Trial steps may take so long altogether [s]."""

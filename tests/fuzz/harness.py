@@ -14,9 +14,16 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
 
-from protocol.bus import InProcessBus
+from protocol.bus.bus import InProcessBus
 from protocol.calls import CALLS, DoStep, ExitInitializationMode, GetOutputs, Initialize
-from protocol.codec import (
+from protocol.errors import (
+    DoublestepError,
+    MalformedMessageError,
+    SlaveBusyError,
+    VersionError,
+)
+from protocol.wire.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey
+from protocol.wire.packing import (
     decode_map,
     decode_program,
     decode_reply,
@@ -26,14 +33,7 @@ from protocol.codec import (
     encode_program,
     encode_request,
 )
-from protocol.errors import (
-    DoublestepError,
-    MalformedMessageError,
-    SlaveBusyError,
-    VersionError,
-)
-from protocol.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey
-from slave_node.node import SlaveNode
+from slave_node.serving.node import SlaveNode
 from tests.fuzz.messages import Kind, Mutator, calls_of_reply
 from tests.light_slaves import LightWorker
 

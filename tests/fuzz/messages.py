@@ -37,9 +37,12 @@ from protocol.calls import (
     SetInputs,
     SetState,
     StepResult,
+    StepStatus,
     Terminate,
 )
-from protocol.codec import (
+from protocol.description import Examination
+from protocol.errors import SlaveBusyError, StepRejectedError
+from protocol.wire.packing import (
     encode_error,
     encode_error_map,
     encode_map,
@@ -48,8 +51,6 @@ from protocol.codec import (
     encode_request,
     encode_single_reply,
 )
-from protocol.errors import SlaveBusyError, StepRejectedError
-from protocol.slave import Examination, StepStatus
 from tests.light_slaves import description_of
 
 _INPUT = np.array([[0.5], [1.0]])

@@ -19,7 +19,7 @@ from typing import IO
 import psutil
 import tomli_w
 
-from protocol.endpoints import free_endpoint
+from protocol.bus.endpoints import free_endpoint
 from tests.nemesis.faults import Fault
 from tests.nemesis.master import DESCRIPTOR
 from tests.nemesis.relay import Relay

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import os
 
-from protocol.command_start import run_command
+from protocol.host.command_start import run_command
 
 DESCRIPTOR = "NEMESIS_DESCRIPTOR"
 
 
 def main() -> None:
     """Run the command, with a progress that tells of attempts."""
-    from master_node import progress  # noqa: PLC0415  it may be interrupted while it is imported
+    from master_node.observing import progress  # noqa: PLC0415  it may be interrupted meanwhile
 
     descriptor = int(os.environ[DESCRIPTOR])
 
@@ -25,7 +25,7 @@ def main() -> None:
             os.write(descriptor, b".")
 
     progress.ProgressBar = TellingBar  # type: ignore[misc]
-    from master_node.cli import main as run  # noqa: PLC0415
+    from master_node.cli.app import main as run  # noqa: PLC0415
 
     run()
 

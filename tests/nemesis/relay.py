@@ -7,7 +7,7 @@ import threading
 from collections.abc import Coroutine
 from typing import Any
 
-from protocol.endpoints import free_endpoint
+from protocol.bus.endpoints import free_endpoint
 from tests.waiting import BOUND
 
 _SLOWNESS = 0.02

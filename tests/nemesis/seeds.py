@@ -19,7 +19,7 @@ import tomli_w
 
 from master_node import load_system, simulate
 from protocol.errors import ConfigurationError, DoublestepError, StepSizeError
-from protocol.scratch import ScratchDirectory
+from protocol.host.scratch import ScratchDirectory
 from tests.nemesis.cast import Cast
 from tests.nemesis.faults import Fault, draw_faults
 from tests.nemesis.systems import DrawnSystem, draw_system

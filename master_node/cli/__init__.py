@@ -1,0 +1,1 @@
+"""The ``master-node`` command, one module for each group of commands."""

@@ -1,0 +1,1 @@
+"""External inputs: tables, functions and recorded signals."""

@@ -1,0 +1,1 @@
+"""From instantiated slaves to initialized ones: configuration, trial steps, T_0."""

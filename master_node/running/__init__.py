@@ -1,0 +1,1 @@
+"""One run of a coupled system, from instantiated slaves to terminated ones."""

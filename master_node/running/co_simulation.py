@@ -1,0 +1,347 @@
+"""One run of a coupled system: initialize, step to the stop time, terminate.
+
+Nothing here knows where a slave is. The steps themselves are in ``controlled_run.py``, with slaves
+of which some have no rollback in ``mixed_run.py``, of which none has in ``defect_run.py``, and,
+without an estimator, in ``fixed_run.py``.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+
+from master_node.coupling.coupled_system import CoupledSystem, SlavePart
+from master_node.coupling.outputs import Outputs
+from master_node.coupling.scheme import (
+    CouplingScheme,
+    output_control,
+    outputs_follow_inputs,
+    slaves_without_rollback,
+)
+from master_node.numerics.collocation import NODES
+from master_node.numerics.error_estimators import ESTIMATORS
+from master_node.observing.observers import (
+    DiscreteType,
+    Observer,
+    Outcome,
+    RunEnd,
+    RunStart,
+    Statistics,
+)
+from master_node.observing.run_warnings import warnings_of
+from master_node.preparing.initialization import initialize
+from master_node.resuming.checkpoints import NO_CHECKPOINTS, Checkpoints, Resumed
+from master_node.running.context import RunContext
+from master_node.running.controlled_run import ControlledRun
+from master_node.running.coupling_run import CouplingRun
+from master_node.running.defect_run import DefectRun
+from master_node.running.fixed_run import FixedRun
+from master_node.running.interrupts import Interrupts
+from master_node.running.mixed_run import MixedRun
+from master_node.slaves.group import SlaveGroup
+from master_node.system.system import System
+from protocol.calls import Terminate
+from protocol.errors import ConfigurationError, DoublestepError, InterruptedRunError
+from protocol.text.names import listed
+from protocol.variables import Causality, VariableType
+
+log = logging.getLogger("master_node")
+
+
+def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
+    """What the slaves' capabilities mean for this run, as warnings for the user.
+
+    Raises:
+        ConfigurationError: an estimator was asked for and a slave cannot change its step size and
+            has no ``step_size`` given, or outputs are to be evaluated again where some slaves have
+            rollback and some have not.
+    """
+    settings = system.simulation
+    without = slaves_without_rollback(coupled)
+    is_mixed = settings.estimator != "none" and 0 < len(without) < len(coupled.parts)
+    if settings.evaluate_outputs and is_mixed:
+        raise ConfigurationError(
+            f"{coupled.parts[without[0]].name}: its state cannot be saved (canGetAndSetFMUstate), "
+            "so its outputs are not known when those of the others would be evaluated again",
+            remedy="leave out evaluate_outputs",
+        )
+    warnings = []
+    for part in coupled.parts:
+        warnings += [f"{part.name}: {remark}" for remark in part.description.remarks]
+        warnings += _local_sources(part)
+        can = part.description.capabilities
+        fixed = system.slaves[part.name].step_size or part.description.fixed_step_size
+        if settings.estimator != "none" and not can.can_handle_variable_step_size and fixed is None:
+            raise ConfigurationError(
+                f"{part.name}: the model cannot handle variable communication step sizes",
+                remedy=f"give {system.places.setting(f'slaves.{part.name}', 'step_size')}, or use "
+                "--estimator none with a fixed --step-size",
+            )
+        highest, wanted = part.max_order, settings.order
+        if part.connected and (highest < (1 if wanted == "auto" else wanted)):
+            warnings.append(
+                f"{part.name} cannot interpolate inputs (canInterpolateInputs): its inputs are "
+                f"held constant in each step, order {highest} instead of {wanted}"
+            )
+        if any(coupled.external.changes[part.external_slice]) and not highest:
+            warnings.append(
+                f"{part.name} cannot interpolate inputs (canInterpolateInputs): its external "
+                "inputs are held at their mean in each step"
+            )
+        has_feed_through = coupled.feed_through[part.output_slice].any()
+        evaluates = settings.evaluate_outputs and has_feed_through
+        if evaluates and not outputs_follow_inputs(part, system):
+            warnings.append(
+                f"{part.name}: its outputs with direct feed-through cannot be evaluated again at "
+                "communication points, as FMI 2.0 does not promise that they follow its inputs "
+                f"without a step; if they do, say so: [slaves.{part.name}] "
+                "outputs_follow_inputs = true"
+            )
+    return warnings + _not_iterated(coupled, system) + _jumps_off_the_grid(coupled, system)
+
+
+def _not_iterated(coupled: CoupledSystem, system: System) -> list[str]:
+    """Where ``coupling = "implicit"`` is asked for and cannot be had."""
+    settings = system.simulation
+    if settings.coupling != "implicit" or settings.estimator == "none":
+        return []
+    without = [coupled.parts[slave].name for slave in slaves_without_rollback(coupled)]
+    if without:
+        return [
+            f'coupling = "implicit" needs slaves that can go back, and the state of {without[0]} '
+            "cannot be saved: inputs are extrapolated"
+        ]
+    held = [p.name for p in coupled.parts if p.connected and p.max_order < NODES]
+    if held:
+        return [
+            f'coupling = "implicit" needs inputs that follow a polynomial of degree {NODES}, and '
+            f"those of {held[0]} do not: inputs are extrapolated; leave out input_substeps = 1"
+        ]
+    return []
+
+
+def _local_sources(part: SlavePart) -> list[str]:
+    """Warnings of sources of inputs that are not meant for other models."""
+    locals_ = [
+        name for name in part.locals if part.description.variable(name).causality is Causality.LOCAL
+    ]
+    if not locals_ or part.description.kind == "Python model":
+        return []
+    return [
+        f"{part.name}: inputs are fed by its local variables {listed(locals_)}: FMI means only "
+        "outputs for other models"
+    ]
+
+
+def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:
+    """Without an estimator no communication point is put where an external input jumps."""
+    settings = system.simulation
+    if settings.estimator != "none":
+        return []
+    start, stop, step_size = float(settings.start_time), settings.end, settings.step_size
+    inside = [jump for jump in coupled.jumps if start < jump.time < stop]
+    steps = np.array([(jump.time - start) / step_size for jump in inside])
+    is_off = np.abs(steps - np.round(steps)) > 1e-9 * np.maximum(1.0, steps)
+    if not is_off.any():
+        return []
+    first = inside[int(np.argmax(is_off))]
+    return [
+        f"{int(is_off.sum())} jumps of external inputs are not at communication points, the first "
+        f"one is that of {first.name} at t={first.time!r} s: in a step over a jump the polynomial "
+        "has the right mean only, and a discrete input its old value; choose a step size that "
+        "meets them, or an estimator"
+    ]
+
+
+def coupling(coupled: CoupledSystem, system: System) -> str:
+    """``explicit``, ``implicit`` or ``auto``: as asked for, if all slaves can be iterated."""
+    wanted = system.simulation.coupling
+    orders = [part.max_order for part in coupled.parts if part.connected]
+    return wanted if min(orders, default=0) >= NODES else "explicit"
+
+
+def enumerations(coupled: CoupledSystem) -> dict[str, Mapping[str, int]]:
+    """The items of all enumerations among the results, by ``slave.variable``."""
+    recorded = (one for one in coupled.recorded.discrete)
+    found = {one.name: one.variable.items for one in recorded}
+    for part in coupled.parts:
+        items = {v.name: v.items for v in part.description.variables if v.items}
+        found |= {f"{part.name}.{n}": items[n] for n in part.discrete_outputs if n in items}
+    return {name: items for name, items in found.items() if items}
+
+
+def _discrete_type(type_: VariableType) -> DiscreteType:
+    """What results hold for a variable of this type."""
+    if type_.is_real:
+        return "float"
+    if type_.integer_range is not None:
+        return "integer"
+    return _DISCRETE_TYPES[type_]
+
+
+_DISCRETE_TYPES: Mapping[VariableType, DiscreteType] = {
+    VariableType.BOOLEAN: "boolean",
+    VariableType.STRING: "string",
+    VariableType.BINARY: "binary",
+}
+
+
+@dataclass
+class CoSimulation:
+    """One run of a coupled system, from instantiated slaves to terminated ones.
+
+    Args:
+        group: the slaves, instantiated.
+        coupled: their connections.
+        system: the settings.
+        observer: is told of everything.
+        outputs: at T_0 of slaves that stand there already; None: they are
+            still to be initialized.
+        checkpoints: are told where the run stands.
+        resumed: where to go on, with slaves that can be restored; None: at T_0.
+    """
+
+    group: SlaveGroup
+    coupled: CoupledSystem
+    system: System
+    observer: Observer
+    outputs: Outputs | None = None
+    checkpoints: Checkpoints = NO_CHECKPOINTS
+    resumed: Resumed | None = None
+
+    def run(self) -> Statistics:
+        """Initialize, step to the stop time, terminate.
+
+        Returns:
+            The run's statistics, which the observer has got too.
+
+        Raises:
+            DoublestepError: after the observer was told; `InterruptedRunError` for Ctrl-C.
+        """
+        settings = self.system.simulation
+        scheme = CouplingScheme.of(self.coupled, self.system)
+        outputs = self.outputs
+        if outputs is None:
+            outputs = initialize(self.group, self.coupled, self.system, scheme.get_outputs)
+        outputs = outputs._replace(y=outputs.y[: scheme.output_rows])
+        self.group.restart_statistics()
+        statistics = Statistics(time=float(settings.start_time), slaves=self.group.statistics)
+        if self.resumed is not None:
+            self.checkpoints.restore(self.resumed)
+            self.group.continue_statistics(self.resumed.statistics)
+            statistics = replace(self.resumed.statistics, slaves=self.group.statistics)
+        self.observer.started(self._start(outputs))
+        begin = perf_counter() - statistics.wall_time
+
+        def update() -> None:
+            statistics.wall_time = perf_counter() - begin
+            statistics.round_trips = self.group.round_trips
+            statistics.wait_time = self.group.wait_time
+            for slave, restarts in self.checkpoints.restarts().items():
+                statistics.slaves[slave].restarts = restarts
+
+        interrupts = Interrupts()
+        outcome, message = Outcome.FAILED, ""
+        try:
+            self.checkpoints.begin(statistics, update)
+            try:
+                with (
+                    np.errstate(over="ignore", invalid="ignore"),  # the norm finds them
+                    interrupts.deferrable(),
+                ):
+                    note = self._steps(scheme, outputs, statistics, interrupts)
+            finally:
+                update()
+                self.group.restart_statistics()
+            failure = self._terminate(statistics.time)
+            outcome = Outcome.TERMINATED if note else Outcome.COMPLETED
+            message = "; ".join(filter(None, (note, failure)))
+        except KeyboardInterrupt:
+            outcome, message = Outcome.INTERRUPTED, f"interrupted at t={statistics.time!r} s"
+            raise InterruptedRunError(message) from None
+        except BaseException as error:
+            message = str(error)
+            raise
+        finally:
+            if not outcome.is_complete:
+                self.checkpoints.broken_off()
+            for warning in warnings_of(statistics):
+                log.warning("%s", warning)
+            self.observer.ended(RunEnd(outcome, statistics, message))
+        self.checkpoints.remove()
+        return statistics
+
+    def _start(self, outputs: Outputs) -> RunStart:
+        """Beginning of the run, as observers are told of it."""
+        coupled, settings = self.coupled, self.system.simulation
+        discrete, recorded = coupled.discrete, coupled.recorded
+        y, d = recorded.split(outputs.y, outputs.d)
+        return RunStart(
+            (*coupled.output_names, *(one.name for one in recorded.continuous)),
+            (*coupled.output_units, *(one.variable.unit for one in recorded.continuous)),
+            float(settings.start_time),
+            settings.end,
+            y[0],
+            (*discrete.names, *(one.name for one in recorded.discrete)),
+            (
+                *map(_discrete_type, discrete.types),
+                *(_discrete_type(one.variable.type) for one in recorded.discrete),
+            ),
+            (*discrete.units, *(one.variable.unit for one in recorded.discrete)),
+            d,
+            frozenset(one.name for one in (*recorded.continuous, *recorded.discrete)),
+            enumerations(coupled),
+            output_control(coupled, self.system),
+            {part.name: part.description.state_kind for part in coupled.parts},
+            self.group.statistics,
+        )
+
+    def _steps(
+        self,
+        scheme: CouplingScheme,
+        outputs: Outputs,
+        statistics: Statistics,
+        interrupts: Interrupts,
+    ) -> str:
+        """Step to the end; a slave's wish to end earlier is returned in words."""
+        context = RunContext(
+            self.group,
+            self.coupled,
+            scheme,
+            self.system,
+            self.observer,
+            statistics,
+            interrupts,
+            self.checkpoints,
+            self.resumed,
+        )
+        estimator = ESTIMATORS.get(self.system.simulation.estimator)
+        if estimator is None:
+            return FixedRun(context).run(outputs)
+        if len(slaves_without_rollback(self.coupled)) == len(self.coupled.parts):
+            return DefectRun(context).run(outputs)
+        if scheme.late_slaves:
+            return MixedRun(context, estimator).run(outputs)
+        if self.system.simulation.constants == "paper":
+            return ControlledRun(context, estimator).run(outputs)
+        return CouplingRun(context, estimator, coupling(self.coupled, self.system)).run(outputs)
+
+    def _terminate(self, time: float) -> str:
+        """Terminate all slaves at the end [s]; the results are complete, whatever they say to it.
+
+        Returns:
+            What went wrong in words, which is a warning, too; or "".
+        """
+        try:
+            replies = self.group.execute([(Terminate(),)] * len(self.group), time)
+            errors = [reply.error for reply in replies if reply.error is not None]
+        except DoublestepError as error:
+            errors = [error]
+        failures = [str(error) for error in errors]
+        for failure in failures:
+            log.warning("the run is complete, but: %s", failure)
+        return "; ".join(failures)

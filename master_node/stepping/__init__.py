@@ -1,0 +1,1 @@
+"""Steps of slaves as requests: single, double and iterated ones."""

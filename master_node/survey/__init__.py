@@ -1,0 +1,1 @@
+"""Participants on the bus, listed and diagnosed."""

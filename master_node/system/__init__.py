@@ -1,0 +1,1 @@
+"""System files: what is to be simulated, and with which settings."""

@@ -1,0 +1,1 @@
+"""Buses: in process and over Zenoh, with endpoints, credentials and access."""

@@ -1,0 +1,1 @@
+"""Text that people read: names, limits, and what is printable."""

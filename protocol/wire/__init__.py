@@ -1,0 +1,1 @@
+"""Messages: keys, records and programs of calls as bytes."""

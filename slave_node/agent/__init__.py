@@ -1,0 +1,1 @@
+"""The agent: starts slaves on its host when masters ask for them."""

@@ -1,0 +1,1 @@
+"""The ``slave-node`` command, one module for each group of commands."""

@@ -1,0 +1,1 @@
+"""A slave on the bus: claims, health, metrics, and masters that vanish."""

@@ -1,0 +1,1 @@
+"""Communication steps split into shorter ones, with inputs that follow polynomials."""

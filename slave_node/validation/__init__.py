@@ -1,0 +1,1 @@
+"""``slave-node validate`` and ``inspect``: what a model can do, in words."""
