@@ -60,7 +60,7 @@ def main(words: list[str]) -> None:
 def _systems(seeds: int, folder: Path) -> Iterator[tuple[str, Path]]:
     """Name and file of each system."""
     for file in sorted(EXAMPLES.rglob("*.toml")):
-        if "slaves" in file.read_text(encoding="utf-8"):
+        if "[slaves" in file.read_text(encoding="utf-8"):
             yield str(file.relative_to(EXAMPLES)), file
     for seed in range(seeds):
         drawn = draw_system(Random(seed), EXAMPLES)

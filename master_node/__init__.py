@@ -37,17 +37,17 @@ __all__ = [
 
 _ELSEWHERE = {
     "Result": "results",
-    "open_system": "system_files",
+    "open_system": "system.files",
     "resume": "simulation",
     "simulate": "simulation",
 }
-"""Modules of what is not in ``configuration``."""
+"""Modules of what is not in ``system.system``."""
 
 
 def __getattr__(name: str) -> object:
     """Import public names when they are asked for: commands need but a part of them."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_ELSEWHERE.get(name, 'configuration')}"), name)
+    value = getattr(import_module(f"{__name__}.{_ELSEWHERE.get(name, 'system.system')}"), name)
     globals()[name] = value
     return value

@@ -2,7 +2,7 @@
 
 u = c(y) of the paper, equation (1b), is here ``factor * y[source] + offset``: each connected input
 takes the value of one output, in its own unit. What is not continuous goes beside it, as values
-that are held in each step (``discrete_coupling.py``).
+that are held in each step (``discrete.py``).
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ END_FILE = ".end.json"
 """The summary of a run that got to its end, while its results are not complete."""
 
 CHECKPOINT_FOLDER = "checkpoint"
-"""Where a run stood that can be resumed, see ``checkpoint_files.py``."""
+"""Where a run stood that can be resumed, see ``resuming/files.py``."""
 
 _UNFINISHED = "{}.part"
 _MAX_GROWTH = 1000

@@ -1,7 +1,7 @@
 """The bus: requests to keys, handlers that serve them, and who is alive.
 
 `Bus` is the waist between everything above and the transport below. Implementations:
-`InProcessBus` here, `ZenohBus` in ``zenoh_bus.py``. Payloads are bytes; nothing here knows what
+`InProcessBus` here, `ZenohBus` in ``zenoh.py``. Payloads are bytes; nothing here knows what
 they mean.
 """
 

@@ -1,6 +1,6 @@
 """Polynomials of a low degree in substeps that act like one of a higher degree over the whole step.
 
-For models that take input derivatives, but not of all orders. As in ``substep_inputs.py``, what
+For models that take input derivatives, but not of all orders. As in ``inputs.py``, what
 counts are the moments of what is held in place of the polynomial u. N pieces of degree m have
 N (m + 1) coefficients, so as many moments can be right; here the first k + 1 are, for u of degree
 k, if there are so many. So lines need half as many substeps as constants. Among all pieces with
@@ -105,7 +105,7 @@ def pieces_needed(
 
     So many that all k + 1 moments can be right. And let r be the relative change of an input in the
     step, and r_2 that part of it which is not along a line; a slave whose f depends on u as a
-    square does is wrong by r r_2^2 / (720 N^4) of its size, see ``substep_inputs.py``.
+    square does is wrong by r r_2^2 / (720 N^4) of its size, see ``inputs.py``.
 
     Args:
         rows: of the polynomial, `substep_inputs.scaled`, shape (k + 1, n), k > m.

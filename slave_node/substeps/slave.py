@@ -99,8 +99,8 @@ def _lengths(number: int, *, meets_end: bool) -> tuple[float, ...]:
 class SubstepSlave(Slave):
     """A slave whose communication steps are substeps of another one.
 
-    With emulated input derivatives each substep has constant inputs, see ``substep_inputs.py``, or
-    lines and parabolas, see ``substep_polynomials.py``; with native ones, and with a polynomial of
+    With emulated input derivatives each substep has constant inputs, see ``inputs.py``, or
+    lines and parabolas, see ``polynomials.py``; with native ones, and with a polynomial of
     a degree that the model takes, it has that around its beginning.
 
     A communication step that is a whole number of the model's fixed steps, or of
