@@ -1,0 +1,26 @@
+"""End of a run whose parent process is gone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+
+from protocol.errors import InterruptedRunError
+from protocol.host.threads import start_thread
+
+_END_TIME = 5.0
+
+
+def end_with_parent() -> None:
+    """Interrupt this process when standard input, a pipe from the parent process, closes."""
+
+    def watch() -> None:
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(_END_TIME)
+        os._exit(InterruptedRunError.exit_code)  # a model in this process does not come back
+
+    start_thread(watch, "parent")

@@ -1,0 +1,276 @@
+"""Commands ``run`` and ``resume``."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from master_node.cli.interruption import end_with_parent
+from master_node.cli.options import (
+    TEXT_FORMAT,
+    Insecure,
+    LogStyle,
+    MetricsHost,
+    MetricsPort,
+    PackageBus,
+    ResultDirectory,
+    Tls,
+)
+from protocol.bus.endpoints import LOOPBACK
+from protocol.errors import ConfigurationError
+from protocol.host.interruption import interruptible
+from protocol.host.logs import LogFormat, configure_logs
+from protocol.host.standard_output import output_of_others
+from protocol.host.terminal import say
+from protocol.host.toml_text import assigned_values
+
+if TYPE_CHECKING:  # each command imports what it needs
+    from master_node.observing.observers import Observer
+
+log = logging.getLogger("master_node")
+
+
+def run(  # noqa: PLR0917  options of the command line
+    system_file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SYSTEM", help="A .toml, .ssp or .ssd file, or PACKAGE.ssp#VARIANT.ssd."
+        ),
+    ],
+    output: Annotated[Path, typer.Option(help="Directory for the results.")] = Path("results"),
+    preset: Annotated[
+        str | None, typer.Option(help="paper: the method as Schierz, Arnold and Clauß have it.")
+    ] = None,
+    order: Annotated[
+        str | None, typer.Option(help="Degree k of the input polynomials, 0 to 3, or auto.")
+    ] = None,
+    derivative_points: Annotated[
+        int | None,
+        typer.Option(min=0, max=2, help="Points at which input polynomials meet derivatives."),
+    ] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="rich, mod, or none for a fixed step.")
+    ] = None,
+    relative_tolerance: Annotated[float | None, typer.Option(help="RTOL of all outputs.")] = None,
+    absolute_tolerance: Annotated[float | None, typer.Option(help="ATOL of all outputs.")] = None,
+    start_time: Annotated[float | None, typer.Option(help="[s]")] = None,
+    stop_time: Annotated[float | None, typer.Option(help="[s]")] = None,
+    controller: Annotated[
+        str | None, typer.Option(help="Of the step size: pi or elementary.")
+    ] = None,
+    sequence: Annotated[
+        str | None, typer.Option(help="jacobi: all slaves at once; gauss-seidel: one by one.")
+    ] = None,
+    coupling: Annotated[
+        str | None,
+        typer.Option(help="explicit; implicit: iterate each double step; auto: where it is stiff."),
+    ] = None,
+    output_interval: Annotated[
+        float | None, typer.Option(help="Write results at multiples of this [s].")
+    ] = None,
+    output_variables: Annotated[
+        list[str] | None,
+        typer.Option(help="Pattern for slave.variable; !PATTERN leaves out; may be repeated."),
+    ] = None,
+    output_locals: Annotated[
+        list[str] | None,
+        typer.Option(help="The same for variables that are no outputs; may be repeated."),
+    ] = None,
+    output_every: Annotated[
+        int | None, typer.Option(help="Keep each N-th result point, the first and the last.")
+    ] = None,
+    output_format: Annotated[
+        list[str] | None, typer.Option(help="csv, arrow, parquet or mat; may be repeated.")
+    ] = None,
+    step_size: Annotated[
+        float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
+    ] = None,
+    case: Annotated[
+        Path | None, typer.Option(help="Parameters of a run of a study, its case.toml.")
+    ] = None,
+    parameter: Annotated[
+        list[str] | None, typer.Option(help="Start value, slave.variable=value; may be repeated.")
+    ] = None,
+    state: Annotated[
+        str | None,
+        typer.Option(help="How all slaves save their states: native, fork, replay or none."),
+    ] = None,
+    in_process: Annotated[
+        bool, typer.Option("--in-process", help="Run the slaves in this process, without a bus.")
+    ] = False,
+    no_launch: Annotated[
+        bool, typer.Option("--no-launch", help="Start no slaves: find all of them on the bus.")
+    ] = False,
+    connect: Annotated[
+        list[str] | None, typer.Option(help="Slave to connect to, tcp/HOST:PORT.")
+    ] = None,
+    listen: Annotated[
+        list[str] | None, typer.Option(help="Where slaves can connect, tcp/HOST:PORT.")
+    ] = None,
+    insecure: Insecure = False,
+    tls: Tls = None,
+    mode: Annotated[
+        str | None, typer.Option(help="peer: reach slaves directly; client: through a router.")
+    ] = None,
+    package_bus: PackageBus = False,
+    timeout: Annotated[
+        float | None, typer.Option(help="How long to wait for slaves to appear [s].")
+    ] = None,
+    pin: Annotated[
+        bool, typer.Option("--pin", help="Keep each launched slave on one processor.")
+    ] = False,
+    no_examine: Annotated[
+        bool, typer.Option("--no-examine", help="Let the slaves take no trial steps first.")
+    ] = False,
+    trace: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Trace of all requests, for Perfetto.")
+    ] = None,
+    metrics_port: MetricsPort = None,
+    metrics_host: MetricsHost = LOOPBACK,
+    log_format: LogStyle = LogFormat.TEXT,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
+    stay_with_parent: Annotated[bool, typer.Option(hidden=True)] = False,
+) -> None:
+    """Run SYSTEM and write results, by default results.csv, steps, summary and a picture."""
+    configure_logs(log_format, TEXT_FORMAT)
+    with interruptible(), ExitStack() as stack:
+        if stay_with_parent:
+            end_with_parent()
+        if in_process:
+            _refuse_beside_in_process(
+                {
+                    "--no-launch": no_launch,
+                    "--connect": connect,
+                    "--listen": listen,
+                    "--insecure": insecure,
+                    "--tls": tls,
+                    "--mode": mode,
+                    "--timeout": timeout is not None,
+                    "--pin": pin,
+                }
+            )
+        from master_node.cli.upload_bar import UploadBar
+        from master_node.observing.progress import ProgressBar
+        from master_node.simulation import run as run_system
+        from master_node.study.case import apply_case, read_case
+        from master_node.system.files import open_system
+
+        opened = stack.enter_context(open_system(system_file, package_bus=package_bus))
+        system = (
+            (opened if case is None else apply_case(opened, read_case(case)))
+            .with_parameters(assigned_values("--parameter", parameter or ()))
+            .with_simulation(
+                preset=preset,
+                order=_order(order),
+                derivative_points=derivative_points,
+                controller=controller,
+                sequence=sequence,
+                coupling=coupling,
+                output_interval=output_interval,
+                estimator=estimator,
+                relative_tolerance=relative_tolerance,
+                absolute_tolerance=absolute_tolerance,
+                start_time=start_time,
+                stop_time=stop_time,
+                initial_step_size=step_size,
+                examine=False if no_examine else None,
+            )
+            .with_slaves(state=state)
+            .with_bus(
+                connect=tuple(connect or ()),
+                listen=tuple(listen or ()),
+                insecure=insecure,
+                tls=None if tls is None else str(tls.absolute()),
+                mode=mode,
+                discovery_timeout=timeout,
+                pin=pin,
+            )
+            .with_results(
+                variables=tuple(output_variables or ()),
+                locals=tuple(output_locals or ()),
+                every=output_every,
+                formats=tuple(output_format or ()),
+            )
+        )
+        observers: list[Observer] = [ProgressBar(quiet=quiet or log_format is LogFormat.JSON)]
+        if metrics_port is not None:
+            observers.append(_served_metrics(stack, metrics_port, metrics_host))
+        uploading = stack.enter_context(UploadBar(quiet=quiet))
+        with output_of_others():
+            run_system(
+                system,
+                output,
+                in_process=in_process,
+                launch=not no_launch,
+                observers=observers,
+                uploading=uploading,
+                trace=trace,
+            )
+        _show(output, quiet=quiet, no_plot=no_plot)
+
+
+def _refuse_beside_in_process(options: Mapping[str, object]) -> None:
+    given = [name for name, value in options.items() if value]
+    if given:
+        raise ConfigurationError(
+            f"{given[0]} is for slaves on the bus, and with --in-process there is none",
+            remedy=f"leave out {given[0]} or --in-process",
+        )
+
+
+def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
+    """What came out: a picture and the summary."""
+    from master_node.observing.progress import summary_table
+    from master_node.results import PLOT_FILE, Result
+    from protocol.host.tables import show
+
+    result = Result.load(directory)
+    if not no_plot:
+        from master_node.results.plots import plot_result
+
+        plot_result(result, directory / PLOT_FILE, show=False, variables=None, is_named=False)
+    if not quiet:
+        show(summary_table(result.summary))
+        say(f"results in {directory}")
+
+
+def resume(
+    directory: ResultDirectory,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Run what a checkpoint names that is not your own.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
+) -> None:
+    """Go on with the run in DIRECTORY that was interrupted or killed, with the settings it had.
+
+    It runs the models and functions that the checkpoint in DIRECTORY names.
+    """
+    with interruptible():
+        from master_node.observing.progress import ProgressBar
+        from master_node.simulation import resume as resume_run
+
+        with output_of_others():
+            resume_run(directory, observers=(ProgressBar(quiet=quiet),), trust=trust)
+        _show(directory, quiet=quiet, no_plot=no_plot)
+
+
+def _served_metrics(stack: ExitStack, port: int, host: str) -> Observer:
+    """An observer whose numbers are served while ``stack`` lasts."""
+    from master_node.observing.metrics import RunMetrics
+    from protocol.host.metrics import metrics_served
+
+    metrics = RunMetrics()
+    log.info("metrics at %s", stack.enter_context(metrics_served(port, host, metrics.read)))
+    return metrics
+
+
+def _order(text: str | None) -> int | str | None:
+    """A number where it is one; whether it may be is for the system to say."""
+    return int(text) if text is not None and text.isdecimal() else text
