@@ -30,7 +30,7 @@ from protocol.wire.keys import (
     alive_agents,
     alive_slaves,
 )
-from protocol.wire.packing import encode_map, encode_record
+from protocol.wire.records import encode_map, encode_record
 
 _EXAMPLES = Path(__file__).parents[1] / "examples"
 _LARGE = bytes(60 * 2**20)

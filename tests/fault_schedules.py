@@ -26,7 +26,7 @@ from protocol.calls import Call, Reply
 from protocol.description import SlaveDescription
 from protocol.errors import DoublestepError, SlaveCrashedError
 from protocol.wire.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey, alive_master
-from protocol.wire.packing import decode_map, encode_map
+from protocol.wire.records import decode_map, encode_map
 from slave_node.serving.node import SlaveNode
 from tests.faulty_bus import NO_FAULTS, Faults, FaultyBus, Network
 from tests.light_slaves import COUPLINGS, LightWorker, system_of_light_slaves

@@ -20,13 +20,9 @@ from protocol.calls import CALLS
 from protocol.errors import DoublestepError
 from protocol.wire.administration import Claim, SlaveStatus
 from protocol.wire.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey, alive_slaves
-from protocol.wire.packing import (
-    PROTOCOL_VERSION,
-    decode_map,
-    encode_map,
-    encode_program,
-    encode_request,
-)
+from protocol.wire.packing import PROTOCOL_VERSION
+from protocol.wire.programs import encode_program, encode_request
+from protocol.wire.records import decode_map, encode_map
 from tests.fuzz.messages import PROGRAMS, Mutator
 
 _VERBS = (EXECUTE, CLAIM, RELEASE, ABORT, STATUS, *(call.verb for call in CALLS))

@@ -59,24 +59,17 @@ from protocol.errors import (
     VersionError,
 )
 from protocol.variables import Causality, Unit, Variable, VariableType
-from protocol.wire import packing as codec
-from protocol.wire.packing import (
+from protocol.wire.packing import MAX_COLUMNS, MAX_MESSAGE_BYTES, PROTOCOL_VERSION
+from protocol.wire.programs import (
     MAX_CALLS,
-    MAX_MESSAGE_BYTES,
-    PROTOCOL_VERSION,
-    decode_map,
     decode_program,
-    decode_reply,
     decode_request,
     decode_single,
-    encode_error,
-    encode_error_map,
-    encode_map,
     encode_program,
-    encode_reply,
     encode_request,
-    encode_single_reply,
 )
+from protocol.wire.records import decode_map, encode_error_map, encode_map
+from protocol.wire.replies import decode_reply, encode_error, encode_reply, encode_single_reply
 
 # ---- What can be said --------------------------------------------------------------------------
 
@@ -801,4 +794,4 @@ def test_the_limits_are_those_of_the_documentation() -> None:
     """64 MB a message, 64 calls a program."""
     assert MAX_MESSAGE_BYTES == 64 * 2**20
     assert MAX_CALLS == 64
-    assert codec.MAX_COLUMNS == 200_000
+    assert MAX_COLUMNS == 200_000

@@ -27,6 +27,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import master_node.cli.app
+import protocol.wire
 import slave_node.cli.app
 from master_node import simulate
 from master_node.hosts.opening import remote as remote_slave
@@ -61,8 +62,7 @@ from protocol.description import Capabilities, SlaveDescription
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState
 from protocol.signals import MAX_ORDER
 from protocol.variables import Variable
-from protocol.wire import packing as codec
-from protocol.wire import text_limits
+from protocol.wire import packing, programs, records, text_limits
 from slave_node.execution.snapshots import LIMIT
 from slave_node.serving.metrics import CountingWorker
 from tests.light_slaves import LightWorker
@@ -469,7 +469,7 @@ def test_the_document_of_studies_has_every_option_reduction_and_column() -> None
 def test_the_messages_are_those_of_the_codec() -> None:
     """The grammar in the document is the one in the codec, line by line."""
     (grammar,) = [b for b in blocks(read("docs/protocol.md"), "") if b.startswith("request")]
-    told = [line.strip() for line in (codec.__doc__ or "").splitlines()]
+    told = [line.strip() for line in (protocol.wire.__doc__ or "").splitlines()]
     assert [
         line for line in grammar.splitlines() if line.strip() and line.strip() not in told
     ] == []
@@ -507,15 +507,15 @@ def test_the_life_cycle_is_the_table_of_the_program() -> None:
 def test_the_limits_are_those_of_the_program() -> None:
     """Version and limits."""
     text = section(read("docs/protocol.md"), "## Versions and limits")
-    assert f"an integer, now {codec.PROTOCOL_VERSION}." in text
+    assert f"an integer, now {packing.PROTOCOL_VERSION}." in text
     limits = {row[0]: int(row[1].split()[0]) for row in tables(text)[0][1:]}
     assert limits == {
-        "length of a message": codec.MAX_MESSAGE_BYTES,
-        "calls in a program": codec.MAX_CALLS,
-        "columns of an array": codec.MAX_COLUMNS,
+        "length of a message": packing.MAX_MESSAGE_BYTES,
+        "calls in a program": programs.MAX_CALLS,
+        "columns of an array": packing.MAX_COLUMNS,
         "rows of an array": MAX_ORDER + 1,
-        "containers (maps and lists) in a message": codec._MAX_CONTAINERS,
-        "fields of an administrative message": codec.MAX_FIELDS,
+        "containers (maps and lists) in a message": packing.MAX_CONTAINERS,
+        "fields of an administrative message": records.MAX_FIELDS,
         "text: the host of a participant": text_limits.MAX_HOST,
         "text: a name of a variable, unit, model, file": text_limits.MAX_NAME,
         "text: a description, cause, remedy, remark": text_limits.MAX_SENTENCE,

@@ -28,7 +28,8 @@ from protocol.host.processes import ending_signals
 from protocol.text.plain_text import printable, shortened
 from protocol.wire.administration import SlaveStatus
 from protocol.wire.keys import CLAIM, START, STATUS, AgentKey, SlaveKey
-from protocol.wire.packing import PROTOCOL_VERSION, encode_map
+from protocol.wire.packing import PROTOCOL_VERSION
+from protocol.wire.records import encode_map
 from tests.quarter_car_case import EXAMPLES
 from tests.ssp_documents import ssd, system
 from tests.test_network import Commands

@@ -41,7 +41,8 @@ from protocol.errors import (
 )
 from protocol.slave import Slave
 from protocol.variables import Causality, VariableType
-from protocol.wire.packing import decode_reply, encode_program
+from protocol.wire.programs import encode_program
+from protocol.wire.replies import decode_reply
 from slave_node.execution.exit_codes import OWN_FAILURE, death
 from slave_node.states.channel import Channel, Message
 from slave_node.states.fork_habits import Event, Habits

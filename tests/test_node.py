@@ -62,14 +62,10 @@ from protocol.wire.keys import (
     alive_master,
     alive_slaves,
 )
-from protocol.wire.packing import (
-    PROTOCOL_VERSION,
-    decode_map,
-    decode_reply,
-    encode_map,
-    encode_program,
-    encode_request,
-)
+from protocol.wire.packing import PROTOCOL_VERSION
+from protocol.wire.programs import encode_program, encode_request
+from protocol.wire.records import decode_map, encode_map
+from protocol.wire.replies import decode_reply
 from slave_node.serving.node import SlaveNode
 from slave_node.worker.process import ModelReference, WorkerProcess
 from tests.waiting import BOUND, is_quick, wait_until

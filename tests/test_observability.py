@@ -39,7 +39,8 @@ from protocol.calls import DoStep, GetOutputs, GetState, Reply, SetState, StepRe
 from protocol.errors import ConfigurationError, ResultsError, SlaveCrashedError, SlaveError
 from protocol.host.logs import LogFormat, about, add_log_fields, configure_logs
 from protocol.host.metrics import Metric, metrics_served
-from protocol.wire.packing import encode_error, encode_program, encode_reply
+from protocol.wire.programs import encode_program
+from protocol.wire.replies import encode_error, encode_reply
 from slave_node.serving.metrics import CountingWorker
 from tests.test_processes import EXAMPLES, FOREVER, Command, has_stepped, start, system_file
 from tests.waiting import BOUND, wait_until

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from protocol.bus.endpoints import Endpoints
 from protocol.bus.zenoh import ZenohBus
 from protocol.wire.keys import STATUS, SlaveKey
-from protocol.wire.packing import decode_map
+from protocol.wire.records import decode_map
 from slave_node.cli.app import app
 from tests.waiting import BOUND, is_quick
 

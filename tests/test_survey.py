@@ -26,7 +26,8 @@ from protocol.bus.zenoh import ZenohBus
 from protocol.errors import MalformedMessageError
 from protocol.wire.administration import MasterStatus, RouterStatus, SlaveStatus
 from protocol.wire.keys import STATUS, MasterKey, RouterKey, SlaveKey
-from protocol.wire.packing import PROTOCOL_VERSION, decode_map, encode_map
+from protocol.wire.packing import PROTOCOL_VERSION
+from protocol.wire.records import decode_map, encode_map
 from slave_node.certificates import Host, make_certificates
 from tests.quarter_car_case import EXAMPLES
 from tests.test_network import Commands

@@ -24,19 +24,13 @@ from protocol.errors import (
 )
 from protocol.text.limits import MAX_HOST, MAX_NAME, MAX_SENTENCE, cut
 from protocol.variables import Variable
-from protocol.wire import packing as codec
+from protocol.wire import descriptions
 from protocol.wire.administration import Claim, Claimed, MasterStatus, RouterStatus
 from protocol.wire.keys import CLAIM, STATUS, AgentKey, MasterKey, RouterKey, SlaveKey
-from protocol.wire.packing import (
-    MAX_FIELDS,
-    MAX_MESSAGE_BYTES,
-    decode_map,
-    decode_reply,
-    decode_single,
-    encode_map,
-    encode_reply,
-    encode_single_reply,
-)
+from protocol.wire.packing import MAX_MESSAGE_BYTES, pack
+from protocol.wire.programs import CALL_FIELDS, decode_single
+from protocol.wire.records import MAX_FIELDS, RECORD_FIELDS, decode_map, encode_map
+from protocol.wire.replies import decode_reply, encode_reply, encode_single_reply
 from slave_node.serving.node import SlaveNode
 from tests.light_slaves import LightWorker
 from tests.test_survey import slave_status
@@ -49,13 +43,13 @@ Check = Callable[[Any, str], Any]
 def every_check() -> list[tuple[str, Check]]:
     """Checks of each field of each message that is decoded, with its name."""
     tables: list[tuple[str, Mapping[str, Check]]] = [
-        *((cls.__name__, checks) for cls, checks in codec._RECORD_FIELDS.items()),
-        *((cls.__name__, checks) for cls, checks in codec._FIELDS.items()),
-        ("Variable", codec._VARIABLE_FIELDS),
-        ("SlaveDescription", codec._DESCRIPTION_FIELDS),
-        ("Capabilities", codec._CAPABILITY_FIELDS),
-        ("Examination", codec._EXAMINATION_FIELDS),
-        ("Unit", codec._UNIT_FIELDS),
+        *((cls.__name__, checks) for cls, checks in RECORD_FIELDS.items()),
+        *((cls.__name__, checks) for cls, checks in CALL_FIELDS.items()),
+        ("Variable", descriptions.VARIABLE_FIELDS),
+        ("SlaveDescription", descriptions.DESCRIPTION_FIELDS),
+        ("Capabilities", descriptions.CAPABILITY_FIELDS),
+        ("Examination", descriptions.EXAMINATION_FIELDS),
+        ("Unit", descriptions.UNIT_FIELDS),
     ]
     return [(f"{cls}.{name}", check) for cls, checks in tables for name, check in checks.items()]
 
@@ -86,7 +80,7 @@ def test_no_field_takes_a_text_of_any_length(field: str, check: Check) -> None:
 def test_a_name_is_taken_up_to_its_limit(size: int) -> None:
     """At the limit, and no further: of inputs in a call, of variables in a description."""
     name = "x" * size
-    message = codec._pack({"inputs": [name]})
+    message = pack({"inputs": [name]})
     description = SlaveDescription("m", "k", (Variable(name),))
     reply = encode_reply(Reply([description], None, 0.0))
     if size == MAX_NAME:

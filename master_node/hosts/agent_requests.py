@@ -8,7 +8,7 @@ from typing import TypeVar
 from protocol.bus.bus import Bus
 from protocol.wire.agents import AgentStatus, Record
 from protocol.wire.keys import AgentKey
-from protocol.wire.packing import decode_record, encode_record
+from protocol.wire.records import decode_record, encode_record
 
 _R = TypeVar("_R", bound=Record)
 

@@ -45,7 +45,7 @@ from protocol.wire.keys import (
     SlaveKey,
     alive_agents,
 )
-from protocol.wire.packing import decode_record, encode_record
+from protocol.wire.records import decode_record, encode_record
 
 log = logging.getLogger("master_node")
 

@@ -11,7 +11,7 @@ from protocol.bus.bus import Bus
 from protocol.text.limits import cut
 from protocol.wire.administration import MasterStatus
 from protocol.wire.keys import MasterKey
-from protocol.wire.packing import encode_map
+from protocol.wire.records import encode_map
 
 
 def announce_run(bus: Bus, run: str, system: System) -> None:

@@ -35,7 +35,7 @@ from protocol.calls import (
     SetState,
     StepStatus,
 )
-from protocol.wire.packing import MAX_CALLS, decode_program, encode_program
+from protocol.wire.programs import MAX_CALLS, decode_program, encode_program
 
 _DIGEST_SIZE = 8
 _LENGTH = Struct("<I")

@@ -17,13 +17,9 @@ from protocol.host.processes import PeerProcess
 from protocol.variables import StartValue
 from protocol.wire.administration import Claim, Claimed, claim_name
 from protocol.wire.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey
-from protocol.wire.packing import (
-    decode_map,
-    decode_reply,
-    encode_map,
-    encode_program,
-    encode_request,
-)
+from protocol.wire.programs import encode_program, encode_request
+from protocol.wire.records import decode_map, encode_map
+from protocol.wire.replies import decode_reply
 
 _CLAIM_MARGIN = 5.0
 _RELEASE_TIME = 5.0

@@ -40,7 +40,7 @@ from protocol.errors import (
     SlaveLostError,
     StepRejectedError,
 )
-from protocol.wire.packing import MAX_CALLS
+from protocol.wire.programs import MAX_CALLS
 
 log = logging.getLogger("master_node")
 

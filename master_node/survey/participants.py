@@ -22,7 +22,7 @@ from protocol.wire.keys import (
     alive_routers,
     alive_slaves,
 )
-from protocol.wire.packing import decode_map, decode_record
+from protocol.wire.records import decode_map, decode_record
 
 log = logging.getLogger("master_node")
 

@@ -1,6 +1,6 @@
 """Messages beside the calls: the claim of a master, and what participants say of themselves.
 
-All travel as flat maps (`protocol.wire.packing.encode_map`), which also hold the protocol version.
+All travel as flat maps (`protocol.wire.records.encode_map`), which also hold the protocol version.
 """
 
 from __future__ import annotations

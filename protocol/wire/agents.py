@@ -1,7 +1,7 @@
 """What masters and agents say to each other: messages of ``doublestep/agents/...``.
 
 An agent starts slaves on its host. All these records travel as maps of their fields
-(`protocol.wire.packing.encode_record`), which also hold the protocol version.
+(`protocol.wire.records.encode_record`), which also hold the protocol version.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ from protocol.wire.keys import (
     SlaveKey,
     alive_agents,
 )
-from protocol.wire.packing import decode_record, encode_error_map, encode_record
+from protocol.wire.records import decode_record, encode_error_map, encode_record
 from slave_node.agent.model_store import ModelStore
 from slave_node.agent.upload_cache import MAX_PARTS, UploadCache
 from slave_node.serving.master_watch import Master, MasterWatch

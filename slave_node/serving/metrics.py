@@ -18,7 +18,8 @@ from protocol.calls import (
 from protocol.description import SlaveDescription
 from protocol.errors import DoublestepError
 from protocol.host.metrics import Metric
-from protocol.wire.packing import decode_program, decode_reply
+from protocol.wire.programs import decode_program
+from protocol.wire.replies import decode_reply
 from slave_node.worker.process import Worker
 
 

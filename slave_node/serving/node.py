@@ -45,19 +45,10 @@ from protocol.wire.keys import (
     SlaveKey,
     alive_slaves,
 )
-from protocol.wire.packing import (
-    MAX_MESSAGE_BYTES,
-    PROTOCOL_VERSION,
-    decode_map,
-    decode_reply,
-    decode_request,
-    decode_single,
-    encode_error,
-    encode_error_map,
-    encode_map,
-    encode_program,
-    encode_single_reply,
-)
+from protocol.wire.packing import MAX_MESSAGE_BYTES, PROTOCOL_VERSION
+from protocol.wire.programs import decode_request, decode_single, encode_program
+from protocol.wire.records import decode_map, encode_error_map, encode_map
+from protocol.wire.replies import decode_reply, encode_error, encode_single_reply
 from slave_node.serving.claims import Claims, Holder
 from slave_node.serving.master_watch import Master, MasterWatch
 from slave_node.worker.process import Worker

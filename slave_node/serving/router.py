@@ -11,7 +11,7 @@ import time
 from protocol.bus.bus import Bus
 from protocol.wire.administration import RouterStatus
 from protocol.wire.keys import RouterKey
-from protocol.wire.packing import encode_map
+from protocol.wire.records import encode_map
 from slave_node.shutdown import wait_for_end
 
 log = logging.getLogger("slave_node")

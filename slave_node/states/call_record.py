@@ -27,7 +27,7 @@ from protocol.calls import (
 from protocol.errors import DoublestepError, SlaveError
 from protocol.signals import MAX_ORDER
 from protocol.variables import StartValue
-from protocol.wire.packing import decode_program, encode_program
+from protocol.wire.programs import decode_program, encode_program
 
 _MAGIC = b"2StepRec"
 _VERSION = 1

@@ -21,7 +21,9 @@ from protocol.calls import Configure, Reply
 from protocol.errors import DoublestepError, SlaveError
 from protocol.host.standard_error import forgive_models
 from protocol.slave import CallExecutor, Slave
-from protocol.wire.packing import decode_map, decode_program, encode_error, encode_reply
+from protocol.wire.programs import decode_program
+from protocol.wire.records import decode_map
+from protocol.wire.replies import encode_error, encode_reply
 from slave_node.execution.executor import Executor
 from slave_node.models import load_model
 from slave_node.states.channel import DURATION, PROCESS, Channel, Message

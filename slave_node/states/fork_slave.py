@@ -47,7 +47,9 @@ from protocol.errors import (
 from protocol.signals import FloatArray
 from protocol.slave import Slave
 from protocol.variables import StartValue
-from protocol.wire.packing import decode_reply, encode_map, encode_program
+from protocol.wire.programs import encode_program
+from protocol.wire.records import encode_map
+from protocol.wire.replies import decode_reply
 from slave_node.states.channel import DURATION, Message
 from slave_node.states.fork_family import HolderFamily
 from slave_node.states.fork_habits import Event, Habits, Situation

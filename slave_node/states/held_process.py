@@ -6,7 +6,7 @@ import socket
 from collections import deque
 
 from protocol.errors import DoublestepError, SlaveCrashedError, SlaveError, SlaveKilledError
-from protocol.wire.packing import decode_reply
+from protocol.wire.replies import decode_reply
 from slave_node.execution.exit_codes import death, how_ended
 from slave_node.states.channel import DURATION, PROCESS, Message
 from slave_node.states.fork_family import HolderFamily

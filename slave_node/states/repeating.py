@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from protocol.calls import GetDiscreteOutputs, GetOutputs, Reply
-from protocol.wire.packing import decode_program, decode_reply, encode_reply
+from protocol.wire.programs import decode_program
+from protocol.wire.replies import decode_reply, encode_reply
 from slave_node.states.channel import Message
 from slave_node.states.step_message import with_outputs
 

@@ -48,7 +48,8 @@ from protocol.errors import (
 from protocol.host.files import is_fmu
 from protocol.signals import MAX_ORDER, FloatArray
 from protocol.variables import Causality
-from protocol.wire.packing import decode_reply, encode_program
+from protocol.wire.programs import encode_program
+from protocol.wire.replies import decode_reply
 from slave_node.trials.steps import STEPS
 from slave_node.worker.process import ModelReference, Worker, WorkerProcess
 

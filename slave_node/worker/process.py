@@ -40,13 +40,8 @@ from protocol.host.threads import LIMITS, start_thread
 from protocol.slave import CallExecutor
 from protocol.variables import StartValue
 from protocol.wire.administration import DEFAULT_LOAD_TIMEOUT
-from protocol.wire.packing import (
-    decode_program,
-    decode_reply,
-    encode_error,
-    encode_program,
-    encode_reply,
-)
+from protocol.wire.programs import decode_program, encode_program
+from protocol.wire.replies import decode_reply, encode_error, encode_reply
 from slave_node.execution.exit_codes import OWN_FAILURE, death, how_ended
 from slave_node.worker.pipe import Pipe
 

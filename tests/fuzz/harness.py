@@ -23,16 +23,15 @@ from protocol.errors import (
     VersionError,
 )
 from protocol.wire.keys import ABORT, CLAIM, EXECUTE, RELEASE, STATUS, SlaveKey
-from protocol.wire.packing import (
-    decode_map,
+from protocol.wire.programs import (
     decode_program,
-    decode_reply,
     decode_request,
     decode_single,
-    encode_map,
     encode_program,
     encode_request,
 )
+from protocol.wire.records import decode_map, encode_map
+from protocol.wire.replies import decode_reply
 from slave_node.serving.node import SlaveNode
 from tests.fuzz.messages import Kind, Mutator, calls_of_reply
 from tests.light_slaves import LightWorker

@@ -42,15 +42,9 @@ from protocol.calls import (
 )
 from protocol.description import Examination
 from protocol.errors import SlaveBusyError, StepRejectedError
-from protocol.wire.packing import (
-    encode_error,
-    encode_error_map,
-    encode_map,
-    encode_program,
-    encode_reply,
-    encode_request,
-    encode_single_reply,
-)
+from protocol.wire.programs import encode_program, encode_request
+from protocol.wire.records import encode_error_map, encode_map
+from protocol.wire.replies import encode_error, encode_reply, encode_single_reply
 from tests.light_slaves import description_of
 
 _INPUT = np.array([[0.5], [1.0]])
