@@ -30,10 +30,10 @@ import master_node.cli.app
 import protocol.wire
 import slave_node.cli.app
 from master_node import simulate
-from master_node.hosts.opening import remote as remote_slave
 from master_node.numerics.error_estimators import EST_MOD, EST_RICH
 from master_node.numerics.reductions import REDUCTIONS
 from master_node.observing.metrics import RunMetrics
+from master_node.slaves import remote as remote_slave
 from master_node.study.configuration import (
     Cases,
     Resources,
