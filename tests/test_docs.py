@@ -61,8 +61,9 @@ from protocol.calls import CALLS
 from protocol.description import Capabilities, SlaveDescription
 from protocol.life_cycle import LIFE_CYCLE, LifeCycleState
 from protocol.signals import MAX_ORDER
+from protocol.text import limits as text_limits
 from protocol.variables import Variable
-from protocol.wire import packing, programs, records, text_limits
+from protocol.wire import packing, programs, records
 from slave_node.execution.snapshots import LIMIT
 from slave_node.serving.metrics import CountingWorker
 from tests.light_slaves import LightWorker
