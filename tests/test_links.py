@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from master_node import Result, load_system, resume, simulate
 from master_node.cli.app import app
-from master_node.results.files import FILES
+from master_node.results.formats import FILES
 from master_node.study.directory import LOCK_FILE, TABLE_FILE
 from master_node.system.files import export_system, import_system, open_system
 from protocol.errors import (

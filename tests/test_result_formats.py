@@ -44,7 +44,7 @@ from master_node.results import (
     parquet_file,
 )
 from master_node.results import writer as writer_module
-from master_node.system.patterns import chosen
+from master_node.results.patterns import chosen
 from protocol.errors import ConfigurationError, ResultsError
 from tests.waiting import BOUND, wait_until
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from master_node.system.patterns import chosen, is_name, matches
+from master_node.results.patterns import chosen, is_name, matches
 from protocol.calls import RecordedValues
 from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError

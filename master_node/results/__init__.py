@@ -21,11 +21,7 @@ bits: equal numbers give equal files, byte for byte.
 from master_node.results.completion import finish, is_complete
 from master_node.results.exclusive import exclusive
 from master_node.results.files import (
-    ARROW_FILE,
-    MAT_FILE,
-    PARQUET_FILE,
     PLOT_FILE,
-    RESULTS_FILE,
     STEPS_FILE,
     SUMMARY_FILE,
 )
@@ -37,11 +33,7 @@ from master_node.results.summary import summarize
 from master_node.results.writer import ResultsWriter
 
 __all__ = [
-    "ARROW_FILE",
-    "MAT_FILE",
-    "PARQUET_FILE",
     "PLOT_FILE",
-    "RESULTS_FILE",
     "STEPS_DTYPE",
     "STEPS_FILE",
     "SUMMARY_FILE",

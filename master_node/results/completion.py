@@ -7,35 +7,23 @@ anew at any time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from master_node.observing.observers import Outcome
 from master_node.results.files import (
-    ARROW_FILE,
     CHECKPOINT_FOLDER,
     END_FILE,
-    MAT_FILE,
-    PARQUET_FILE,
     START_FILE,
     STREAM_FILE,
     SUMMARY_FILE,
     synchronize_folder,
 )
+from master_node.results.formats import FORMATS, is_made_at_the_end, stream_of
 from master_node.results.summary import formats_of, read_json, write_json
 from protocol.errors import InterruptedRunError, ResultsError
-
-
-def stream_of(directory: Path, formats: Iterable[str]) -> Path:
-    """The file that Parquet and MAT are made from."""
-    return directory / (ARROW_FILE if "arrow" in formats else STREAM_FILE)
-
-
-def is_made_at_the_end(settings: Mapping[str, Any]) -> bool:
-    """Whether a format is asked for that is made from the stream."""
-    return not {"parquet", "mat"}.isdisjoint(formats_of(settings))
 
 
 def complete(directory: Path, summary: Mapping[str, Any]) -> None:
@@ -51,7 +39,7 @@ def complete(directory: Path, summary: Mapping[str, Any]) -> None:
         InterruptedRunError: Ctrl-C; the rows stay, and `finish` goes on.
     """
     try:
-        if is_made_at_the_end(summary["settings"]):
+        if is_made_at_the_end(formats_of(summary["settings"])):
             write_json(directory / END_FILE, summary)
             synchronize_folder(directory)
             convert(directory, summary["settings"])
@@ -103,15 +91,11 @@ def convert(directory: Path, settings: Mapping[str, Any]) -> None:
     """
     formats = formats_of(settings)
     stream = stream_of(directory, formats)
-    makers: Mapping[str, Callable[[], None]] = {
-        "parquet": lambda: _make_parquet(directory / PARQUET_FILE, stream),
-        "mat": lambda: _make_mat(directory / MAT_FILE, stream, settings),
-    }
     errors: list[ResultsError] = []
-    for format_, make in makers.items():
-        if format_ in formats:
+    for name, result_format in FORMATS.items():
+        if name in formats and result_format.convert is not None:
             try:
-                make()
+                result_format.convert(directory / result_format.file_name, stream, settings)
             except ResultsError as error:
                 errors.append(error)
     if errors:
@@ -131,19 +115,6 @@ def _how_to_go_on(directory: Path) -> str:
         if any(file.exists() for file in files)
         else ""
     )
-
-
-def _make_parquet(path: Path, stream: Path) -> None:
-    # pyarrow takes a tenth of a second to import, which other runs need not pay
-    from master_node.results.parquet_file import write_parquet  # noqa: PLC0415
-
-    write_parquet(path, stream)
-
-
-def _make_mat(path: Path, stream: Path, settings: Mapping[str, Any]) -> None:
-    from master_node.results.dymola_mat import constants_of, write_mat  # noqa: PLC0415  as above
-
-    write_mat(path, stream, constants_of(settings))
 
 
 def _tidy(directory: Path) -> None:

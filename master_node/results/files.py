@@ -14,10 +14,6 @@ from master_node.observing.observers import Point
 from protocol.errors import ResultsError
 from protocol.host.new_files import open_new, open_old
 
-RESULTS_FILE = "results.csv"
-ARROW_FILE = "results.arrow"
-PARQUET_FILE = "results.parquet"
-MAT_FILE = "results.mat"
 STEPS_FILE = "steps.csv"
 SUMMARY_FILE = "summary.json"
 PLOT_FILE = "results.png"
@@ -34,27 +30,9 @@ END_FILE = ".end.json"
 CHECKPOINT_FOLDER = "checkpoint"
 """Where a run stood that can be resumed, see ``resuming/files.py``."""
 
-_UNFINISHED = "{}.part"
+UNFINISHED = "{}.part"
 _MAX_GROWTH = 1000
 _GROWTH_FREE_BYTES = 2**30
-
-FILES = (
-    END_FILE,  # first, as it needs the others
-    SUMMARY_FILE,
-    RESULTS_FILE,
-    ARROW_FILE,
-    PARQUET_FILE,
-    MAT_FILE,
-    STEPS_FILE,
-    PLOT_FILE,
-    START_FILE,
-    STREAM_FILE,
-    *map(
-        _UNFINISHED.format,
-        (ARROW_FILE, STREAM_FILE, PARQUET_FILE, MAT_FILE, SUMMARY_FILE, START_FILE, END_FILE),
-    ),
-)
-"""All that a run may leave and the next one in the same directory replaces."""
 
 _REMEDIES = {
     errno.ENOSPC: "free space on that disk or choose a results directory on another one",
@@ -185,7 +163,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     Raises:
         OSError: it cannot be written; ``path`` is as it was.
     """
-    unfinished = path.with_name(_UNFINISHED.format(path.name))
+    unfinished = path.with_name(UNFINISHED.format(path.name))
     try:
         with open_new(unfinished) as file:
             yield file
@@ -236,7 +214,7 @@ def cannot_read(path: Path, error: OSError) -> ResultsError:
         return malformed(path, str(error))
     return ResultsError(
         f"cannot read {path}: {error.strerror or error}",
-        remedy="name a results directory, or a file .csv, .arrow, .parquet or .mat",
+        remedy="name a results directory, or one of the files with results in it",
     )
 
 

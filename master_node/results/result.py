@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,19 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from master_node.results.columns import NOTHING_KNOWN, DiscreteArray, Known, Table
-from master_node.results.csv_file import read_csv
 from master_node.results.files import (
-    ARROW_FILE,
-    FILES,
-    MAT_FILE,
-    PARQUET_FILE,
-    RESULTS_FILE,
     START_FILE,
     STEPS_FILE,
-    STREAM_FILE,
     SUMMARY_FILE,
     check_is_file,
 )
+from master_node.results.formats import FILES, read_results, read_results_file
 from master_node.results.steps_file import Steps, read_steps
 from master_node.results.summary import read_json
 from protocol.signals import FloatArray
@@ -161,54 +155,16 @@ class Result:
         A directory may come from a run that goes on or was killed: an unfinished last line or
         batch is left out, ``steps`` and ``summary`` are empty where their files are missing. Of
         several formats the first of CSV, Arrow, Parquet and MAT is read. A file is read by its
-        suffix, ``.arrow``, ``.parquet`` or ``.mat``, and else as CSV.
+        suffix, see `master_node.results.formats`, and without a known one as CSV.
 
         Raises:
             ResultsError: there are no results, or a file is malformed; names file and line.
         """
         source = Path(source)
         if not source.is_dir():
-            read = _FILE_READERS.get(source.suffix.lower(), _read_foreign_csv)
-            return cls.of(read(source, NOTHING_KNOWN), Steps(), {})
+            return cls.of(read_results_file(source, NOTHING_KNOWN), Steps(), {})
         for name in FILES:
             check_is_file(source / name)
         summary = read_json(source / SUMMARY_FILE)
         known = Known.of(summary or read_json(source / START_FILE))
-        files = (source / name for name in _PREFERRED)
-        path = next((path for path in files if path.is_file()), source / RESULTS_FILE)
-        table = _READERS[path.suffix](path, known)
-        return cls.of(table, read_steps(source / STEPS_FILE), summary)
-
-
-_PREFERRED = (RESULTS_FILE, ARROW_FILE, PARQUET_FILE, STREAM_FILE, MAT_FILE)
-
-
-def _read_foreign_csv(path: Path, known: Known) -> Table:
-    return read_csv(path, known, complete_lines=False)
-
-
-def _read_arrow(path: Path, _: Known) -> Table:
-    from master_node.results.arrow_file import read_arrow  # noqa: PLC0415  pyarrow takes 0.1 s
-
-    return read_arrow(path)
-
-
-def _read_parquet(path: Path, _: Known) -> Table:
-    from master_node.results.parquet_file import read_parquet  # noqa: PLC0415  as above
-
-    return read_parquet(path)
-
-
-def _read_mat(path: Path, known: Known) -> Table:
-    from master_node.results.dymola_mat import read_mat  # noqa: PLC0415  scipy.io takes longer
-
-    return read_mat(path, known)
-
-
-_READERS: Mapping[str, Callable[[Path, Known], Table]] = {
-    ".csv": read_csv,
-    ".arrow": _read_arrow,
-    ".parquet": _read_parquet,
-    ".mat": _read_mat,
-}
-_FILE_READERS = {**_READERS, ".csv": _read_foreign_csv}
+        return cls.of(read_results(source, known), read_steps(source / STEPS_FILE), summary)

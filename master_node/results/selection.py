@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from master_node.observing.observers import Attempt, Observer, Point, RunEnd, RunStart
-from master_node.system.patterns import chosen, is_name, matches
+from master_node.results.patterns import chosen, is_name, matches
 from protocol.errors import ConfigurationError
 from protocol.text.names import nearest
 

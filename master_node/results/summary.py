@@ -14,6 +14,9 @@ from master_node.observing.observers import RunEnd, RunStart
 from master_node.observing.run_warnings import warnings_of
 from master_node.results.columns import Columns
 from master_node.results.files import cannot_read, cannot_write, malformed, replacing
+from master_node.results.formats import FORMATS
+
+_WITHOUT_TEXTS = [name for name, one in FORMATS.items() if not one.holds_texts]
 
 
 def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> dict[str, Any]:
@@ -73,7 +76,7 @@ def about_columns(columns: Columns, settings: Mapping[str, object]) -> dict[str,
     texts = [name for name, type_ in columns.types.items() if type_ in ("string", "binary")]
     return {
         "formats": list(formats),
-        "not_in_mat": texts if "mat" in formats else [],
+        **{f"not_in_{name}": texts if name in formats else [] for name in _WITHOUT_TEXTS},
         "units": columns.all_units,
         "discrete_types": columns.types,
         "enumerations": columns.items,

@@ -16,17 +16,10 @@ from master_node.results.completion import (
     complete,
     convert,
     failed,
-    is_made_at_the_end,
-    stream_of,
 )
-from master_node.results.csv_file import CsvFile
 from master_node.results.files import (
     CHECKPOINT_FOLDER,
-    FILES,
-    MAT_FILE,
-    PARQUET_FILE,
     PLOT_FILE,
-    RESULTS_FILE,
     START_FILE,
     STEPS_FILE,
     STREAM_FILE,
@@ -34,6 +27,7 @@ from master_node.results.files import (
     ResultsFile,
     cannot_write,
 )
+from master_node.results.formats import FILES, MADE_AT_THE_END, growing_files, is_made_at_the_end
 from master_node.results.steps_file import StepsFile
 from master_node.results.summary import (
     about_columns,
@@ -49,7 +43,7 @@ from protocol.host.new_files import remove_folder
 FLUSH_INTERVAL = 0.5
 """Shortest time between two writes [s]: what a killed master loses at most of a fast run."""
 
-_MADE_AT_THE_END = (SUMMARY_FILE, PARQUET_FILE, MAT_FILE, PLOT_FILE)
+_OF_THE_END = (SUMMARY_FILE, *MADE_AT_THE_END, PLOT_FILE)
 
 
 class ResultsWriter:
@@ -182,20 +176,13 @@ class ResultsWriter:
         try:
             if self._resumed is None:
                 self._remove_old()
-            if "csv" in self._formats:
-                path = self._directory / RESULTS_FILE
-                self._results.append(CsvFile(path, columns, points))
-            if "arrow" in self._formats or is_made_at_the_end(self._settings):
-                # pyarrow takes a tenth of a second to import, which other runs need not pay
-                from master_node.results.arrow_file import ArrowFile  # noqa: PLC0415
-
-                path = stream_of(self._directory, self._formats)
-                hash_ = settings_sha256(self._settings)
-                self._results.append(ArrowFile(path, columns, hash_, points))
+            hash_ = settings_sha256(self._settings)
+            for path, open_file in growing_files(self._directory, self._formats):
+                self._results.append(open_file(path, columns, hash_, points))
             path = self._directory / STEPS_FILE
             self._steps = StepsFile(path, columns.names, attempts)
             if self._resumed is not None:
-                for path in map(self._directory.joinpath, _MADE_AT_THE_END):
+                for path in map(self._directory.joinpath, _OF_THE_END):
                     path.unlink(missing_ok=True)
         except OSError as error:
             raise cannot_write(path, error) from error
@@ -245,7 +232,7 @@ class ResultsWriter:
         """Parquet and MAT of a run that did not get to its end; where one fails, the stream stays
         in their place.
         """
-        if not is_made_at_the_end(self._settings):
+        if not is_made_at_the_end(self._formats):
             return
         convert(self._directory, self._settings)
         if not self._can_resume:

@@ -12,6 +12,7 @@ from master_node.coupling.coupled_system import CoupledSystem, resolve
 from master_node.coupling.step_sizes import check_step_sizes, with_fixed_steps
 from master_node.inputs.loading import load_signals
 from master_node.numerics.reductions import REDUCTIONS_OF_VALUES
+from master_node.results.patterns import chosen
 from master_node.results.selection import check_variables
 from master_node.results.summary import settings_sha256
 from master_node.simulation import settings_of
@@ -19,7 +20,6 @@ from master_node.study.case import Case, apply_case
 from master_node.study.cases import cases_of
 from master_node.study.configuration import Study
 from master_node.system.files import open_system
-from master_node.system.patterns import chosen
 from master_node.system.system import InputSettings, System
 from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError, DoublestepError

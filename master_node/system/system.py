@@ -35,6 +35,7 @@ from pydantic_core import ErrorDetails
 
 from master_node.numerics.dense_output import OutputGrid
 from master_node.numerics.extrapolation import InputPolynomial
+from master_node.results.formats import FORMATS
 from master_node.system.places import SspPlaces, SystemFilePlaces
 from master_node.system.toml_files import read_located_tables
 from protocol.errors import ConfigurationError
@@ -87,6 +88,13 @@ def _sha256(value: str) -> str:
     return value
 
 
+def _format(value: str) -> str:
+    if value not in FORMATS:
+        *names, last = map(repr, FORMATS)
+        raise ValueError(f"write {', '.join(names)} or {last}")
+    return value
+
+
 def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:
     if not value:
         raise ValueError("must not be empty")
@@ -127,7 +135,7 @@ Wait = Annotated[Number, Field(gt=0, le=1e6)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Reference = Annotated[StrictStr, AfterValidator(_reference)]
 Pattern = Annotated[StrictStr, AfterValidator(_pattern)]
-Format = Literal["csv", "arrow", "parquet", "mat"]
+Format = Annotated[StrictStr, AfterValidator(_format)]
 Scalar = StrictBool | StrictInt | StrictFloat | StrictStr
 Value = Scalar | tuple[Scalar, ...] | tuple[tuple[Scalar, ...], ...]
 """A value, or those of an array with one or two dimensions."""
