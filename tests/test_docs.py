@@ -195,17 +195,17 @@ def help_of(program: str, command: str) -> str:
 
 
 @pytest.mark.parametrize("program", APPS)
-def test_the_readme_names_every_command(program: str) -> None:
+def test_the_table_of_commands_names_every_command(program: str) -> None:
     """The table of commands has them all."""
     for name in get_command(APPS[program]).commands:
-        assert f"`{program} {name} " in read("README.md")
+        assert f"`{program} {name} " in read("docs/commands.md")
 
 
-def test_the_readme_names_every_option_of_a_run_and_no_other() -> None:
+def test_the_table_names_every_option_of_a_run_and_no_other() -> None:
     """The table of options and ``--help`` agree."""
-    text = section(read("README.md"), "## Commands")
+    text = section(read("docs/commands.md"), "## Options of `master-node run`")
     known = set(re.findall(r"--[a-z-]+", help_of("master-node", "run"))) - {"--help"}
-    rows = [row[0] for row in tables(text)[1][1:]]
+    rows = [row[0] for row in tables(text)[0][1:]]
     assert set(re.findall(r"--[a-z-]+", " ".join(rows))) == known
 
 
@@ -236,9 +236,9 @@ def test_every_option_of_every_command_is_told_somewhere(program: str) -> None:
                 assert re.search(rf"{option}(?![\w-])", told), f"{program} {name} {option}"
 
 
-def test_the_readme_gives_every_exit_code_a_meaning() -> None:
+def test_the_documents_give_every_exit_code_a_meaning() -> None:
     """The table of exit codes and the error tree agree."""
-    (table,) = [t for t in tables(read("README.md")) if t[0][0] == "exit code"]
+    (table,) = tables(section(read("docs/commands.md"), "## Exit codes"))
     codes = {cls.exit_code for cls in error_classes()} | {0}
     assert {int(row[0]) for row in table[1:]} == codes
 
@@ -252,11 +252,11 @@ def error_classes() -> list[type[errors.DoublestepError]]:
     ]
 
 
-def test_the_readme_names_every_dependency_and_no_other() -> None:
+def test_the_documents_name_every_dependency_and_no_other() -> None:
     """The table of dependencies and pyproject.toml agree."""
     declared = tomllib.loads(read("pyproject.toml"))["project"]["dependencies"]
     names = {re.split(r"[<>=~! ]", dependency)[0] for dependency in declared}
-    (table,) = tables(section(read("README.md"), "## Dependencies"))
+    (table,) = tables(section(read("CONTRIBUTING.md"), "## Dependencies"))
     assert {row[0] for row in table[1:]} == names
 
 
@@ -286,9 +286,9 @@ def test_the_ten_lines_run_as_they_stand(fmu_dir: Path, tmp_path: Path) -> None:
     assert (tmp_path / "quarter_car.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_system_file_of_the_readme_is_the_example(tmp_path: Path) -> None:
+def test_the_complete_system_file_is_the_example(tmp_path: Path) -> None:
     """It holds the same tables, and it is valid."""
-    (text,) = blocks(section(read("README.md"), "## A system file"), "toml")
+    (text,) = blocks(section(read("docs/system-file.md"), "## A complete example"), "toml")
     example = tomllib.loads(read("examples/quarter_car/displacement.toml"))
     assert tomllib.loads(text) == example
     (tmp_path / "system.toml").write_text(text, encoding="utf-8")
@@ -297,7 +297,7 @@ def test_the_system_file_of_the_readme_is_the_example(tmp_path: Path) -> None:
 
 def test_the_examples_in_the_document_of_system_files_are_valid() -> None:
     """Tolerances of one output, and inputs, can be written as shown."""
-    text, inputs = blocks(read("docs/system-file.md"), "toml")
+    text, inputs, _ = blocks(read("docs/system-file.md"), "toml")
     driven = System(slaves={"wheel": {}}, **tomllib.loads(inputs)).inputs
     assert driven["wheel.z"] == InputSettings(table="road.csv", column="z")
     table = tomllib.loads(text)["slaves"]["wheel"]
