@@ -1,1 +1,1 @@
-"""What master and slave must agree on: calls, signals, errors, wire format, keys and the bus."""
+"""Protocol of master and slave: calls, signals, errors, wire format, keys and the bus."""

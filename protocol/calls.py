@@ -296,7 +296,7 @@ CALLS: tuple[type[Call], ...] = (
 
 
 class StepStatus(StrEnum):
-    """How a do_step ended when it raised nothing.
+    """Status of a do_step that raised nothing.
 
     ``EARLY_RETURN``: the slave stands at an event within the step (FMI 3.0, section 4.2.1.2.1).
     """
@@ -308,7 +308,7 @@ class StepStatus(StrEnum):
 
 
 class StepResult(NamedTuple):
-    """How a `DoStep` ended.
+    """Result of a `DoStep`.
 
     Attributes:
         status: ok, discard, early_return or terminated.
@@ -332,7 +332,7 @@ class RecordedValues(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """What a program of calls gave.
+    """Reply to a program of calls.
 
     Attributes:
         results: one for each call that was executed, in order.

@@ -10,7 +10,7 @@ from protocol.variables import Causality, Unit, Variable
 
 
 class StateKind(StrEnum):
-    """How the state of a slave is saved and restored.
+    """Kind of saved state: how the state of a slave is saved and restored.
 
     ``NATIVE``: by the model itself. ``FORK``: the process that holds the model forks, and the copy
     stays frozen as the saved state. ``REPLAY``: the model is reset and everything since its
@@ -24,7 +24,7 @@ class StateKind(StrEnum):
 
 
 class InputDerivatives(StrEnum):
-    """How a slave follows polynomial inputs.
+    """Way in which a slave follows polynomial inputs.
 
     ``NATIVE``: the model takes derivatives. ``EMULATED``: its slave node splits each step into
     substeps, with inputs that are constant in each or of the degree that the model takes. ``NONE``:
@@ -38,7 +38,7 @@ class InputDerivatives(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What a slave declares that it can do (FMI 2.0, section 4.3.1).
+    """Capabilities that a slave declares (FMI 2.0, section 4.3.1).
 
     Attributes:
         outputs_follow_inputs: outputs read after ``set_inputs``, without a step in between, belong
@@ -122,7 +122,7 @@ class SlaveDescription:
 
 
 class StateVerdict(StrEnum):
-    """What a test of saved states showed.
+    """Verdict of a test of saved states.
 
     ``EXACT``: bit for bit as without. ``RESTARTS_SOLVER``: steps after a restore repeat, but differ
     from those without, within the tolerance, because the model's solver starts anew.
@@ -159,7 +159,7 @@ class Examination:
         not_repeating: outputs that no other slave depends on, and that were others each time the
             same step was taken, or by each step however short, such as clocks and counters. Unless
             all of them were known before, nothing else was tried.
-        poor_derivatives: outputs whose derivatives are of no use, with the reason in words.
+        poor_derivatives: outputs whose derivatives cannot be used, with the reason in words.
         not_tried: what was left out because steps take long, in words.
     """
 

@@ -44,7 +44,7 @@ class InputSignal:
         return value
 
     def shifted(self, offset: float) -> InputSignal:
-        """The same polynomial around T + offset."""
+        """Polynomial around T + offset."""
         d = self.derivatives
         k = len(d) - 1
         if k == 0:

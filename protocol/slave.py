@@ -153,7 +153,7 @@ class CallExecutor(Protocol):
 
     @property
     def description(self) -> SlaveDescription:
-        """Of the slave."""
+        """Description of the slave."""
         ...
 
     def execute(self, calls: Sequence[Call]) -> Reply:

@@ -95,7 +95,7 @@ class SlaveProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Id of the process."""
         return self._process.pid
 
     @property
@@ -110,7 +110,7 @@ class SlaveProcess:
         return self.exit_code
 
     def last_lines(self) -> tuple[str, ...]:
-        """What it said last: at most 20 lines, each cut to 500 characters, no empty ones."""
+        """Last lines that it said: at most 20, each cut to 500 characters, no empty ones."""
         with suppress(OSError), self.log.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(0, size - _TAIL_BYTES))
@@ -183,7 +183,7 @@ def end_error(name: str, exit_code: int, lines: Sequence[str], remedy: str) -> D
 
 
 def describe_exit(exit_code: int) -> str:
-    """How a process ended, in a few words."""
+    """End of a process, in a few words."""
     if exit_code < 0:
         return f"died by signal {-exit_code}"
     return f"ended with exit code {exit_code}"

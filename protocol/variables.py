@@ -45,7 +45,7 @@ class VariableType(StrEnum):
 
     @property
     def is_real(self) -> bool:
-        """Whether its values are floating-point numbers."""
+        """True if its values are floating-point numbers."""
         return self in _REAL_TYPES
 
     @property

@@ -72,7 +72,7 @@ def load_executor(
     log_all: bool = False,
     state_kind: str = "",
 ) -> CallExecutor:
-    """The same, ready to execute calls and to load the model in another configuration.
+    """Executor of a model, ready for calls and to load the model in another configuration.
 
     What a worker uses, and a master that runs a slave in its own process. ``state_kind`` holds
     where a configuration names none.

@@ -36,7 +36,7 @@ from protocol.text.names import nearest
 from protocol.variables import Causality, Variable
 
 Values = FloatArray | Sequence[float]
-"""What a model may return: an array, or a list or tuple of numbers."""
+"""Values that a model may return: an array, or a list or tuple of numbers."""
 
 
 def real(
@@ -47,7 +47,7 @@ def real(
     Args:
         name: unique within the model.
         unit: such as ``N.s/m``.
-        start: start value [unit]; of no use for an output that is not a state.
+        start: start value [unit]; not used for an output that is not a state.
         nominal: typical size [unit], positive; for a state it scales the absolute tolerance.
         description: one line for the user.
     """
@@ -116,7 +116,7 @@ class Model:
 
 
 def describe(model: type[Model]) -> SlaveDescription:
-    """What a master must know of a model class, after a check of its declarations.
+    """Description of a model class for a master, after a check of its declarations.
 
     Variables come in the order inputs, outputs, states that are no outputs, parameters.
 
@@ -219,7 +219,7 @@ def _check_methods(model: type[Model]) -> None:
 
 
 def _source_sha256(model: type[Model]) -> str:
-    """Of the file that defines the class; of its qualified name where there is no file."""
+    """Hash of the file that defines the class; of its qualified name where there is no file."""
     try:
         source = Path(inspect.getfile(model)).read_bytes()
     except (OSError, TypeError):

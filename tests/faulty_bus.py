@@ -355,7 +355,7 @@ class _FaultyCaller(Caller):
             None,
         )
         if server is None or self._is_cancelled:
-            pending.fail(SlaveLostError(f"nobody serves {self._key}"))
+            pending.fail(SlaveLostError(f"no participant serves {self._key}"))
             return pending
         bus.pending[pending] = server
         service = server.service(self._key)

@@ -585,7 +585,7 @@ def test_a_saved_state_is_trusted_by_its_outputs(
         executed(twin, *drawn_step(again, time, 1e-2)),
     )
     texts = warnings(caplog)
-    assert ("of no use in another process" in texts[0]) == forgets
+    assert ("cannot be used in another process" in texts[0]) == forgets
     assert "it died; started again and restored" in texts[-1]
     assert slave.restarts == 1 + forgets
     assert slave.can_serialize != forgets

@@ -62,8 +62,8 @@ def section() -> str:
             "master-node run examples/oscillators/two_mass.toml --in-process --order 2 "
             "--controller elementary --output results",
         ),
-        "**When to use which.** PI, the default, wherever a rejection is dear: where saving and "
-        "restoring a state takes long, or where a model logs each step. `elementary` for the "
+        "**When to use which.** PI, the default, wherever a rejection is expensive: where saving "
+        "and restoring a state takes long, or where a model logs each step. `elementary` for the "
         "paper's numbers.",
         "A slave may have rules for its own steps: a smallest or a largest size, multiples of the "
         "step of its own solver, or a single size. Then H is rounded down so that all slaves' "

@@ -80,11 +80,11 @@ def section() -> str:
             "master-node run examples/quarter_car/displacement_force.toml --in-process "
             "--output results",
         ),
-        "**When to use it.** Where computing is dear and a round trip is cheap: it saves do_steps, "
-        "most of all with a low order, and takes six round trips for a double step instead of two, "
-        "one for each of its do_steps and one for each evaluation. It needs slaves whose outputs "
-        "follow their inputs without a step. FMI 2.0 does not promise that, so an FMU has to be "
-        "declared; Python models always do.",
+        "**When to use it.** Where computing is expensive and a round trip is cheap: it saves "
+        "do_steps, most of all with a low order, and takes six round trips for a double step "
+        "instead of two, one for each of its do_steps and one for each evaluation. It needs "
+        "slaves whose outputs follow their inputs without a step. FMI 2.0 does not "
+        "promise that, so an FMU has to be declared; Python models always do.",
     )
 
 

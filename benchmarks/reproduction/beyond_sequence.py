@@ -51,5 +51,6 @@ def section() -> str:
         "processors or hosts: its round trips do not depend on the number of slaves. Gauss-Seidel "
         "for two or three slaves with a stiff coupling, as in two_mass, where H is bounded by "
         "stability and not by accuracy, or where all slaves share one processor and have to wait "
-        "for each other anyway. With many slaves its round trips are dear and it gains little.",
+        "for each other anyway. With many slaves its round trips are expensive and it "
+        "gains little.",
     )

@@ -43,7 +43,7 @@ def list_(
         return
     show(*listing_tables(participants))
     if not participants:
-        log.warning("nobody is on the bus; `master-node doctor` says what to look at")
+        log.warning("the bus is empty; `master-node doctor` says what to look at")
 
 
 def doctor(

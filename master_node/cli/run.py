@@ -58,10 +58,10 @@ def run(  # noqa: PLR0917  options of the command line
     ] = None,
     relative_tolerance: Annotated[float | None, typer.Option(help="RTOL of all outputs.")] = None,
     absolute_tolerance: Annotated[float | None, typer.Option(help="ATOL of all outputs.")] = None,
-    start_time: Annotated[float | None, typer.Option(help="[s]")] = None,
-    stop_time: Annotated[float | None, typer.Option(help="[s]")] = None,
+    start_time: Annotated[float | None, typer.Option(help="First time of the run [s].")] = None,
+    stop_time: Annotated[float | None, typer.Option(help="Last time of the run [s].")] = None,
     controller: Annotated[
-        str | None, typer.Option(help="Of the step size: pi or elementary.")
+        str | None, typer.Option(help="Controller of the step size: pi or elementary.")
     ] = None,
     sequence: Annotated[
         str | None, typer.Option(help="jacobi: all slaves at once; gauss-seidel: one by one.")
@@ -79,7 +79,7 @@ def run(  # noqa: PLR0917  options of the command line
     ] = None,
     output_locals: Annotated[
         list[str] | None,
-        typer.Option(help="The same for variables that are no outputs; may be repeated."),
+        typer.Option(help="Pattern for variables that are no outputs; may be repeated."),
     ] = None,
     output_every: Annotated[
         int | None, typer.Option(help="Keep each N-th result point, the first and the last.")
@@ -110,7 +110,7 @@ def run(  # noqa: PLR0917  options of the command line
         list[str] | None, typer.Option(help="Slave to connect to, tcp/HOST:PORT.")
     ] = None,
     listen: Annotated[
-        list[str] | None, typer.Option(help="Where slaves can connect, tcp/HOST:PORT.")
+        list[str] | None, typer.Option(help="Address to which slaves can connect, tcp/HOST:PORT.")
     ] = None,
     insecure: Insecure = False,
     tls: Tls = None,
@@ -119,7 +119,7 @@ def run(  # noqa: PLR0917  options of the command line
     ] = None,
     package_bus: PackageBus = False,
     timeout: Annotated[
-        float | None, typer.Option(help="How long to wait for slaves to appear [s].")
+        float | None, typer.Option(help="Bound on the wait for slaves to appear [s].")
     ] = None,
     pin: Annotated[
         bool, typer.Option("--pin", help="Keep each launched slave on one processor.")
@@ -225,7 +225,7 @@ def _refuse_beside_in_process(options: Mapping[str, object]) -> None:
 
 
 def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
-    """What came out: a picture and the summary."""
+    """Picture and summary of a run that has ended."""
     from master_node.observing.progress import summary_table
     from master_node.results import PLOT_FILE, Result
     from protocol.host.tables import show

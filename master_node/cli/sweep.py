@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # each command imports what it needs
 
 def sweep(  # noqa: PLR0917  as above
     study_file: Annotated[
-        Path, typer.Argument(metavar="STUDY.toml", help="What to vary, and how.")
+        Path, typer.Argument(metavar="STUDY.toml", help="A study: parameters to vary, and how.")
     ],
     output: Annotated[
         Path | None,
@@ -37,7 +37,7 @@ def sweep(  # noqa: PLR0917  as above
         bool, typer.Option("--retry-failed", help="Run those again that have failed.")
     ] = False,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Lose runs of another study in the directory.")
+        bool, typer.Option("--replace", help="Delete runs of another study in the directory.")
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
 ) -> None:
@@ -87,5 +87,5 @@ def _dask_runner(
 
 
 def _processors() -> int:
-    """How many this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

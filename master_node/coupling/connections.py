@@ -63,7 +63,7 @@ class ScalarConnection(NamedTuple):
 
     @property
     def is_continuous(self) -> bool:
-        """Whether the input follows a polynomial; else it is held constant in each step."""
+        """True if the input follows a polynomial; else it is held constant in each step."""
         return self.source.variable.is_continuous_real and self.target.variable.is_continuous_real
 
 
@@ -118,7 +118,7 @@ class VariableFinder:
         return self._variables[slave].get(name, [])
 
     def names(self, slave: str) -> list[str]:
-        """Of all variables and arrays of a slave."""
+        """Names of all variables and arrays of a slave."""
         return list(self._variables[slave])
 
 
@@ -245,7 +245,7 @@ def _elements(
 
 
 def _indices(ends: list[End]) -> list[str]:
-    """What stands in brackets behind an array's name; nothing for a single variable."""
+    """Indices in brackets behind an array's name; nothing for a single variable."""
     return [] if len(ends) == 1 else [end.variable.name.rpartition("[")[2] for end in ends]
 
 

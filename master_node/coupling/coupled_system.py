@@ -183,7 +183,7 @@ class CoupledSystem:
 
     @property
     def jumps(self) -> list[Jump]:
-        """Of all that drives inputs from outside, in order of time."""
+        """Jumps of all that drives inputs from outside, in order of time."""
         return sorted((*self.external.jumps, *self.discrete.jumps))
 
     @cached_property
@@ -333,7 +333,7 @@ def _depends(
     direct: Mapping[_Key, tuple[str, ...]],
     inputs: Mapping[str, Sequence[str]],
 ) -> NDArray[np.bool_]:
-    """Whether each output depends directly on one of these inputs of its slave, shape (m,)."""
+    """True if each output depends directly on one of these inputs of its slave, shape (m,)."""
     names = [frozenset(inputs[part.name]) for part in parts]
     return np.array(
         [

@@ -1,4 +1,4 @@
-"""What is not continuous: integers, booleans, strings, enumerations, binaries, discrete reals.
+"""Discrete variables: integers, booleans, strings, enumerations, binaries, discrete reals.
 
 Such an output is read at communication points, and an input that it feeds is held until the next
 one. It takes no part in extrapolation and in the error norm.
@@ -112,12 +112,12 @@ class DiscreteCoupling:
 
     @cached_property
     def is_empty(self) -> bool:
-        """Whether all of the system is continuous."""
+        """True if all of the system is continuous."""
         return not self.keys and not self.holds_inputs
 
     @cached_property
     def holds_inputs(self) -> bool:
-        """Whether any slave has discrete inputs that are connected, or change from outside."""
+        """True if any slave has discrete inputs that are connected, or change from outside."""
         return any(self.inputs) or any(self.driven)
 
     @cached_property

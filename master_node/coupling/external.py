@@ -27,11 +27,11 @@ GivenSignal = StartValue | Table | HoldRows | SignalFunction
 """A constant, a table or a function."""
 
 Signals = Mapping[str, GivenSignal]
-"""What drives inputs from outside, by ``slave.variable``, see `load_signals`."""
+"""Signals that drive inputs from outside, by ``slave.variable``, see `load_signals`."""
 
 
 class SlaveExternals(NamedTuple):
-    """What drives the inputs of one slave from outside.
+    """Signals that drive the inputs of one slave from outside.
 
     Attributes:
         continuous: in the order of its variables.

@@ -22,7 +22,7 @@ from protocol.variables import StartValue
 
 
 class Outputs(NamedTuple):
-    """What the slaves gave.
+    """Outputs of all slaves at one point.
 
     Attributes:
         y: continuous outputs, shape (m,) or (rows, m), with derivatives in further rows.
@@ -34,7 +34,7 @@ class Outputs(NamedTuple):
 
 
 NO_OUTPUTS = Outputs(np.zeros((1, 0)))
-"""Of a system without discrete variables, where those at the beginning of a step are not needed."""
+"""Outputs where nothing is discrete, and those at the beginning of a step are not needed."""
 
 
 def gather(coupled: CoupledSystem, replies: Sequence[Reply], rows: int = 1) -> Outputs:

@@ -1,4 +1,4 @@
-"""What a run tells its observers of accepted steps: results where they are wanted, counters."""
+"""Points that a run tells its observers: results where they are wanted, and counters."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Reached = tuple[ReachedPoint, ...]
 
 
 class ResultMemory(NamedTuple):
-    """What is remembered from one accepted step to the next.
+    """Memory from one accepted step to the next.
 
     Attributes:
         history: outputs at the last communication points.
@@ -94,7 +94,7 @@ class ResultPoints:
 
     @property
     def memory(self) -> ResultMemory:
-        """What is remembered; set it to go on from there."""
+        """Memory; set it to go on from there."""
         return ResultMemory(self._history, self._d, self._number)
 
     @memory.setter
@@ -126,7 +126,7 @@ class ResultPoints:
         return tuple(map(Point, times, values, held))
 
     def jumped(self, reached: Reached) -> Points:
-        """The same for points that lead over a discontinuity: nothing smooth lies between them."""
+        """Points that lead over a discontinuity: nothing smooth lies between them."""
         reached = self._split(reached)
         time, y, _ = reached[-1]
         self._history = OutputHistory((time,), (y,))

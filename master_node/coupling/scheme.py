@@ -1,4 +1,4 @@
-"""How the slaves of a system are coupled within a step: sequence, input polynomials, outputs read.
+"""Coupling of slaves within a step: their sequence, input polynomials, outputs that are read.
 
 Everything here follows from the connections, the slaves' capabilities and the settings, once,
 before the first step.
@@ -21,7 +21,7 @@ from protocol.calls import GetOutputs
 
 @dataclass(frozen=True)
 class CouplingScheme:
-    """What the double step and the error estimates need to know of a system.
+    """Facts of a system that the double step and the error estimates need.
 
     Attributes:
         groups: indices of the slaves that take a step at the same time, group after group: one
@@ -59,7 +59,7 @@ class CouplingScheme:
 
     @property
     def known_ahead(self) -> int:
-        """How many points at the end of a step are known for some inputs before it: 0 or 1."""
+        """Number of points at the end of a step that some inputs know before it: 0 or 1."""
         return int(len(self.groups) > 1)
 
     def open_loop(self, coupled: CoupledSystem) -> tuple[str, ...]:
@@ -181,7 +181,7 @@ def output_control(coupled: CoupledSystem, system: System) -> OutputControl:
 
 
 def _late_slaves(coupled: CoupledSystem, system: System) -> tuple[int, ...]:
-    """Those that others take double steps before; none where nobody takes any."""
+    """Those that others take double steps before; none where no slave takes any."""
     slaves = slaves_without_rollback(coupled)
     is_mixed = system.simulation.estimator != "none" and len(slaves) < len(coupled.parts)
     return slaves if is_mixed else ()
@@ -194,6 +194,6 @@ def _evaluated(coupled: CoupledSystem, system: System) -> tuple[int, ...]:
 
 
 def outputs_follow_inputs(part: SlavePart, system: System) -> bool:
-    """Whether a slave's outputs can be read again after its inputs were set, without a step."""
+    """True if a slave's outputs can be read again after its inputs were set, without a step."""
     stated = system.slaves[part.name].outputs_follow_inputs
     return part.description.capabilities.outputs_follow_inputs if stated is None else stated

@@ -39,7 +39,7 @@ def with_fixed_steps(system: System, descriptions: Mapping[str, SlaveDescription
 
 
 def step_size_limits(system: System) -> StepSizeLimits:
-    """What the simulation's settings and the slaves' rules leave for H.
+    """Limits for H from the simulation's settings and the slaves' rules.
 
     Raises:
         ConfigurationError: nothing.
@@ -127,7 +127,7 @@ def crossings(
 
 
 def check_step_sizes(system: System) -> None:
-    """Whether there are step sizes that suit all slaves, before any of them is started.
+    """True if there are step sizes that suit all slaves, before any of them is started.
 
     Raises:
         ConfigurationError: there are none.
@@ -139,7 +139,7 @@ def check_step_sizes(system: System) -> None:
 
 
 def fixed_step_limits(system: System) -> StepSizeLimits:
-    """What the slaves' rules say of the fixed step of the simulation.
+    """Fixed step of the simulation under the slaves' rules.
 
     Raises:
         ConfigurationError: it contradicts them.

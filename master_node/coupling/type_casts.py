@@ -18,7 +18,7 @@ _EXACT_INTEGERS = {
 
 
 def cast(source: Variable, target: Variable) -> Cast | None:
-    """How a value of ``source`` becomes one of ``target``.
+    """Cast of a value of ``source`` to one of ``target``.
 
     An integer becomes an enumeration's item that has its number.
 
@@ -86,7 +86,7 @@ def mapped_cast(
     target: Variable,
     entries: Mapping[bool, bool] | Mapping[int, int],
 ) -> MappedCast | None:
-    """How values of one type become some of another by a mapping.
+    """Cast of values of one type to values of another by a mapping.
 
     Args:
         source: the output.

@@ -27,7 +27,7 @@ class Transformation(NamedTuple):
 
     @property
     def is_identity(self) -> bool:
-        """Whether the value is handed on as it is."""
+        """True if the value is handed on as it is."""
         return self == IDENTITY
 
 

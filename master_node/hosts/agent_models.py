@@ -34,7 +34,7 @@ _LOSSES = 3  # of an upload that others displace
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """How far a model is on its way.
+    """Progress of the upload of a model.
 
     Attributes:
         slave: for which it is.

@@ -139,7 +139,7 @@ class Agents:
                 raise error.located(slave=name, phase="start") from None
             except _UnsuitableError:
                 if monotonic() > self._deadline:
-                    raise self._nobody(name, settings, seen) from None
+                    raise self._no_agent(name, settings, seen) from None
             sleep(_PAUSE)
 
     def restart(self, name: str) -> SlaveKey:
@@ -307,7 +307,7 @@ class Agents:
         log.info("%s is started by agent %s on %s", wanted.slave, seen.key.name, seen.status.host)
         return SlaveKey(wanted.slave, started.instance)
 
-    def _nobody(
+    def _no_agent(
         self, name: str, settings: SlaveSettings, seen: Sequence[SeenAgent]
     ) -> SlaveLostError:
         there = "; ".join(

@@ -1,4 +1,4 @@
-"""What a master says of its run on the bus."""
+"""Announcement of a run on the bus."""
 
 from __future__ import annotations
 

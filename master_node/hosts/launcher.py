@@ -14,7 +14,7 @@ from protocol.wire.keys import SlaveKey
 
 
 class Starter(Protocol):
-    """Who has started slaves for a run, and can say what became of their processes."""
+    """Launcher of slaves for a run, which can say what became of their processes."""
 
     def check(self) -> None:
         """Raise for the first slave process that has ended.
@@ -31,7 +31,7 @@ class Starter(Protocol):
         ...
 
     def how_ended(self, name: str) -> str:
-        """The same in a few words; "" while it runs or when it is not ours."""
+        """End of a process in a few words; "" while it runs or when it is not ours."""
         ...
 
     def wait_ended(self, name: str, timeout: float) -> DoublestepError | None:

@@ -291,7 +291,7 @@ def _release(remotes: Mapping[str, RemoteSlave]) -> None:
 
 
 def describe(links: Mapping[str, SlaveLink]) -> dict[str, SlaveDescription]:
-    """What each slave says of itself; raises what it answers instead, with its name."""
+    """Descriptions of the slaves; raises a slave's error, with its name."""
     for link in links.values():
         link.start([Describe()])
     descriptions = {}

@@ -281,5 +281,5 @@ class Presence:
 
 
 def _is_called(name: str, key: SlaveKey) -> bool:
-    """Whether a slave is found by ``name``; those that were started for a run are not."""
+    """True if a slave is found by ``name``; those that were started for a run are not."""
     return key.name == name and not key.is_of_run

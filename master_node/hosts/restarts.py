@@ -42,7 +42,7 @@ class Restarts:
         self._started = started
 
     def is_mine(self, name: str) -> bool:
-        """Whether the slave of that name is one that can be started again here."""
+        """True if the slave of that name is one that can be started again here."""
         return name in self._started
 
     def restart(self, name: str) -> RemoteSlave:

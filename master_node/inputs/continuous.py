@@ -41,7 +41,7 @@ class SignalFunction:
 
 
 Signal = float | Table | SignalFunction
-"""What can drive a continuous input of type Real."""
+"""Signal that can drive a continuous input of type Real."""
 
 
 class ExternalInput(NamedTuple):
@@ -70,7 +70,7 @@ class ExternalInput(NamedTuple):
 
     @property
     def degree(self) -> int:
-        """Of its polynomials."""
+        """Degree of its polynomials."""
         if isinstance(self.signal, Table):
             return self.max_order
         if isinstance(self.signal, SignalFunction):
@@ -79,7 +79,7 @@ class ExternalInput(NamedTuple):
 
     @property
     def is_constant(self) -> bool:
-        """Whether it never changes."""
+        """True if it never changes."""
         return not isinstance(self.signal, Table | SignalFunction)
 
 
@@ -95,7 +95,7 @@ class ExternalSignal(NamedTuple):
     end: FloatArray
 
     def shifted(self, offset: float) -> ExternalSignal:
-        """The same polynomials around a point ``offset`` [s] later."""
+        """Polynomials around a point ``offset`` [s] later."""
         if not self.end.size:
             return self
         return ExternalSignal(InputSignal(self.rows).shifted(offset).derivatives, self.end)

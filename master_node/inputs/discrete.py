@@ -116,7 +116,7 @@ class DrivenInput:
     Attributes:
         slave, variable: its names.
         signal: that drives it.
-        is_searched: whether it may change where nobody has declared it, as a discrete output does.
+        is_searched: whether it may change at undeclared times, as a discrete output does.
     """
 
     slave: str

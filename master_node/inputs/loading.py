@@ -30,7 +30,7 @@ _TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600
 
 
 def load_signals(system: System) -> dict[str, StartValue | Table | HoldRows | SignalFunction]:
-    """What drives the inputs in ``[inputs]``, by ``slave.variable``.
+    """Signals that drive the inputs in ``[inputs]``, by ``slave.variable``.
 
     Loading a function runs the code of its module. Files are read once, whatever the number of
     columns that are used.

@@ -33,14 +33,14 @@ _MUCH_SMALLER = 0.25
 """Part of H at which the defect of a smooth input is less than half of what it was."""
 
 _PART = 0.5
-"""Of a change that was foreseen: a smaller defect is one of a smooth input."""
+"""Fraction of a change that was foreseen: a smaller defect is one of a smooth input."""
 
 _SHARE = 0.1
 """Part of the jump that is looked for, above which another one beside it is met too: several jumps
 of an input may lie in one bracket."""
 
 _SURPRISE, _TWICE = 10.0, 2.0
-"""How many times larger than expected, and than the change that was foreseen, a defect is that only
+"""Factor by which a defect exceeds what was expected, and the change that was foreseen, that only
 a jump explains."""
 
 _FAR, _GREAT_SURPRISE = 10.0, 50.0

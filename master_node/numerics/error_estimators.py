@@ -52,7 +52,7 @@ class ErrorEstimator:
     paper_ratios: tuple[float, ...]
 
     def points(self, points: int) -> int:
-        """How deep a history must be for input polynomials through ``points`` points."""
+        """Depth of history for input polynomials through ``points`` points."""
         return 2 * points - 1 if self.comparison is Comparison.LONG_STEP else points
 
     def available(self, points: int) -> int:

@@ -32,7 +32,7 @@ class InputPolynomial(NamedTuple):
 
     @property
     def points(self) -> int:
-        """How many communication points it goes through."""
+        """Number of communication points it goes through."""
         return self.order + 1 - self.derivative_points
 
     def limited(self, order: int, derivative_points: int, points: int) -> InputPolynomial:
@@ -54,7 +54,7 @@ POLYNOMIALS = tuple(
 
 
 class InputKind(NamedTuple):
-    """What polynomials an input can have.
+    """Kind of polynomials that an input can have.
 
     Attributes:
         max_order: highest degree that its slave takes; 0 without canInterpolateInputs.
@@ -178,7 +178,7 @@ class Extrapolation:
         self._polynomials = lru_cache(self._limited)
 
     def polynomials(self, polynomial: InputPolynomial, points: int) -> Polynomials:
-        """What ``polynomial`` becomes for each kind, through ``points`` points at most."""
+        """Polynomials that ``polynomial`` becomes, per kind, through at most ``points`` points."""
         return self._polynomials(polynomial, points)
 
     def _limited(self, polynomial: InputPolynomial, points: int) -> Polynomials:
@@ -226,7 +226,7 @@ class Extrapolation:
     def nodes_at(
         self, offsets: Nodes, polynomials: Polynomials, known_ahead: int = 0
     ) -> list[Nodes]:
-        """The same through points at these offsets [s]."""
+        """Polynomial through points at these offsets [s]."""
         begins = self._begins[known_ahead]
         if len(polynomials) == 1:
             return [_nodes(offsets, begins[0], polynomials[0])]
@@ -266,7 +266,7 @@ class Extrapolation:
         step_size: float,
         known_ahead: int = 0,
     ) -> StepInputs:
-        """The same at both ends of a step of ``step_size`` [s]; other arguments as for `signal`."""
+        """Signals at both ends of a step of ``step_size`` [s]; other arguments as for `signal`."""
         if polynomials == _LINES and self._begins[known_ahead][0] == known_ahead:  # the usual ones
             times, inputs = history.times, history.inputs
             now, before = known_ahead, known_ahead + 1

@@ -15,7 +15,7 @@ import numpy as np
 from protocol.signals import FloatArray
 
 MEMORY = 5
-"""How many differences of earlier residuals are used at most."""
+"""Largest number of differences of earlier residuals that are used."""
 
 
 class NoFixedPointError(Exception):

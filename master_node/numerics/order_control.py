@@ -33,8 +33,8 @@ REST = 3
 """Double steps from one change to the next."""
 
 TIMES_BETTER = 2
-"""How often in a row another polynomial must be better, unless it is of the next higher degree and
-meets one derivative at most."""
+"""Number of times in a row that another polynomial must be better, unless it is of the next higher
+degree and meets one derivative at most."""
 
 SMOOTH = 0.25
 """Derivatives at two points are used where H u^(4) / 4! is less than this part of u^(3) / 3!: with
@@ -52,7 +52,7 @@ NO_BOUNDS: Mapping[InputPolynomial, float] = MappingProxyType({})
 
 
 class OrderMemory(NamedTuple):
-    """What is remembered from one accepted step to the next.
+    """Memory from one accepted step to the next.
 
     Attributes:
         polynomial: in use.
@@ -91,12 +91,12 @@ class Candidate(NamedTuple):
         return sizes
 
     def is_known(self, magnitudes: FloatArray) -> bool:
-        """Whether there are divided differences of the order that it takes."""
+        """True if there are divided differences of the order that it takes."""
         return bool(self.orders.max() + 1 < len(magnitudes))
 
 
 class Choice(NamedTuple):
-    """What the order control says.
+    """Decision of the order control.
 
     Attributes:
         memory: to hand in with the next accepted step; holds the polynomial to use.

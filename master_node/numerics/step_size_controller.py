@@ -10,7 +10,7 @@ from master_node.numerics.powers import power
 
 
 class ControllerMemory(NamedTuple):
-    """What a controller remembers from one attempt to the next.
+    """Memory of a controller from one attempt to the next.
 
     Attributes:
         error_norm: ERR of the last accepted step; NaN when there is none to compare with.
@@ -26,7 +26,7 @@ NOTHING = ControllerMemory()
 
 
 class StepDecision(NamedTuple):
-    """What the controller says of an attempt.
+    """Decision of the controller on an attempt.
 
     Attributes:
         accepted: ERR <= 1; never for NaN or infinity.
@@ -138,7 +138,7 @@ def last_step_size(time: float, stop_time: float, step_size: float) -> float:
 
 
 def fixed_steps(start_time: float, stop_time: float, step_size: float) -> int:
-    """How many steps of H lead from ``start_time`` to ``stop_time``, a last shorter one included.
+    """Number of steps of H from ``start_time`` to ``stop_time``, a last shorter one included.
 
     Points start + n H and the stop time are sums with a few rounding errors: a remainder of that
     size is no step.

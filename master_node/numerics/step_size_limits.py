@@ -36,7 +36,7 @@ class StepSizeLimitsError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class StepSizeLimits:
-    """What holds for all slaves together.
+    """Limits of step sizes that hold for all slaves together.
 
     Attributes:
         smallest, largest: bounds of H [s].
@@ -104,7 +104,7 @@ class StepSizeLimits:
         return StepSizeLimits(low[0], high[0], quantum, longest, stop_time)
 
     def check_span(self, begin: float, end: float, together: int = 2) -> None:
-        """Whether steps lead from ``begin`` to ``end`` [s], ``together`` of one size each time.
+        """True if steps lead from ``begin`` to ``end`` [s], ``together`` of one size each time.
 
         Raises:
             StepSizeLimitsError: not with steps that are multiples of the quantum.
@@ -119,7 +119,7 @@ class StepSizeLimits:
             )
 
     def check_ways(self, origin: float, ways: Sequence[tuple[float, float]]) -> None:
-        """Whether double steps lead from each beginning to its end [s].
+        """True if double steps lead from each beginning to its end [s].
 
         Args:
             origin: from where multiples are counted [s].
@@ -137,11 +137,11 @@ class StepSizeLimits:
 
     @property
     def lead_everywhere(self) -> bool:
-        """Whether double steps lead to any point that is not nearer than one of the smallest H."""
+        """True if double steps lead to any point that is not nearer than one of the smallest H."""
         return self.quantum is None and self.largest >= 2.0 * self.smallest
 
     def leads(self, origin: float, begin: float, end: float) -> bool:
-        """Whether double steps between the bounds of H lead from ``begin`` to ``end`` [s]."""
+        """True if double steps between the bounds of H lead from ``begin`` to ``end`` [s]."""
         if self.quantum is None:
             left = (end - begin) / 2.0
             rounding = self._rounding(begin, end)
@@ -218,11 +218,11 @@ class StepSizeLimits:
         return target if is_last else end
 
     def has_reached(self, time: float, target: float) -> bool:
-        """Whether ``time`` is ``target`` [s], or nearer to it than any step leads."""
+        """True if ``time`` is ``target`` [s], or nearer to it than any step leads."""
         return target - time < _NO_STEP * self.smallest
 
     def is_cut_short(self, times: DoubleStepTimes, step_size: float) -> bool:
-        """Whether a double step has a smaller H than it would have with nothing to end on.
+        """True if a double step has a smaller H than it would have with nothing to end on.
 
         Args:
             times: of the double step.
@@ -262,7 +262,7 @@ class StepSizeLimits:
         return _planned(size, left, low, self.largest + rounding, rounding)
 
     def _planned_units(self, step_size: float, left: int) -> int:
-        """Of how many quanta the next H is, with ``left`` of them to fill."""
+        """Number of quanta of the next H, with ``left`` of them to fill."""
         assert self.quantum is not None
         fewest = self._fewest
         units = max(fewest, int(_decimal(step_size) // self.quantum))
@@ -277,19 +277,19 @@ class StepSizeLimits:
         return 4.0 * ulp(max(abs(begin), abs(end))) + _ROUNDING * self.smallest
 
     def _units(self, origin: float, time: float) -> int:
-        """Of how many quanta ``time`` [s] is from ``origin`` [s]."""
+        """Number of quanta from ``origin`` [s] to ``time`` [s]."""
         assert self.quantum is not None
         return round((Fraction(time) - _decimal(origin)) / self.quantum)
 
     @property
     def _fewest(self) -> int:
-        """Of how many quanta H is at least."""
+        """Smallest number of quanta of H."""
         assert self.quantum is not None
         return max(1, ceil(_decimal(self.smallest) / self.quantum))
 
     @property
     def _most(self) -> int:
-        """Of how many quanta H is at most."""
+        """Largest number of quanta of H."""
         assert self.quantum is not None
         return int(_decimal(self.largest) // self.quantum)
 
@@ -350,7 +350,7 @@ def _planned(
 
 
 def _can_be_filled(left: _Size, smallest: _Size, largest: _Size) -> bool:
-    """Whether sizes between the bounds fill what is left; see `_planned`."""
+    """True if sizes between the bounds fill what is left; see `_planned`."""
     return ceil(left / largest) * smallest <= left
 
 

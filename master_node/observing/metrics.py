@@ -1,4 +1,4 @@
-"""What Prometheus can ask of a run."""
+"""Metrics of a run, for Prometheus."""
 
 from __future__ import annotations
 

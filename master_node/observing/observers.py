@@ -1,4 +1,4 @@
-"""What a run tells those who watch it: results, progress, in-memory recording.
+"""Observers of a run: what a run tells to results, progress and recording in memory.
 
 The algorithm calls observers between steps and never reads anything back from them. An observer
 that raises ends the run with that error.
@@ -15,7 +15,7 @@ from protocol.calls import Call
 from protocol.signals import FloatArray
 
 DiscreteType = Literal["float", "integer", "boolean", "string", "binary"]
-"""What a discrete variable holds: FMI's Real, Integer or Enumeration, Boolean, String, Binary."""
+"""Value of a discrete variable: FMI's Real, Integer or Enumeration, Boolean, String, Binary."""
 
 DiscreteValue = float | int | bool | str | bytes
 """A value of one of these types, in their order. An ``integer`` has 64 bits and a sign."""
@@ -41,7 +41,7 @@ NOT_CONTROLLED = OutputControl()
 
 @dataclass(frozen=True, slots=True)
 class RunStart:
-    """What is known before the first step.
+    """Facts of a run that are known before the first step.
 
     Attributes:
         output_names: ``slave.variable`` of the m outputs, in the order of all output arrays.
@@ -125,7 +125,7 @@ class Attempt(NamedTuple):
 
 
 class Outcome(StrEnum):
-    """How a run ended."""
+    """Outcome of a run."""
 
     COMPLETED = "completed"
     TERMINATED = "terminated by a slave"
@@ -134,7 +134,7 @@ class Outcome(StrEnum):
 
     @property
     def is_complete(self) -> bool:
-        """Whether the run got to its end; others may be resumed."""
+        """True if the run got to its end; others may be resumed."""
         return self in (Outcome.COMPLETED, Outcome.TERMINATED)
 
 
@@ -161,7 +161,7 @@ class SlaveStatistics:
 
     @property
     def transport_time(self) -> float:
-        """What of the time of its requests it did not compute [s]: the way there and back."""
+        """Time of its requests in which it did not compute [s]: the way there and back."""
         return max(0.0, self.request_time - self.compute_time)
 
 
@@ -219,7 +219,7 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class RunEnd:
-    """How it went.
+    """End of a run: its outcome and counters.
 
     Attributes:
         outcome: how the run ended.

@@ -1,4 +1,4 @@
-"""What a person at the prompt sees of a run: a bar on the way, a table at the end."""
+"""Progress of a run at the prompt: a bar on the way, a table at the end."""
 
 from __future__ import annotations
 

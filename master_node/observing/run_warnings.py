@@ -1,4 +1,4 @@
-"""Warnings at the end of a run: parts of it that are uncertain, or dear.
+"""Warnings at the end of a run: parts of it that are uncertain or expensive.
 
 Everything follows from the counters, so a run that was resumed says the same.
 """

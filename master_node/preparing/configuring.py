@@ -41,7 +41,7 @@ def configure(
 def reconfigure(
     group: SlaveGroup, configurations: Mapping[str, Configure]
 ) -> dict[str, SlaveDescription]:
-    """The same for some slaves, with what is given for each; errors as for `configure`."""
+    """Configure some slaves, with what is given for each; errors as for `configure`."""
     slaves = [i for i, name in enumerate(group.names) if name in configurations]
     programs: list[Program] = [(configurations[group.names[i]],) for i in slaves]
     descriptions = {}
@@ -55,7 +55,7 @@ def reconfigure(
 
 
 def configuration(slave: str, system: System, description: SlaveDescription) -> Configure:
-    """What the system says of how a model is to be run.
+    """Configuration of a model in the words of the system.
 
     Args:
         slave: its name.

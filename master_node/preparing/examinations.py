@@ -40,10 +40,10 @@ from protocol.signals import FloatArray
 from protocol.variables import Causality
 
 LADDER = (StateKind.NATIVE, StateKind.FORK, StateKind.REPLAY, StateKind.NONE)
-"""How states are saved, the best way first."""
+"""Ways of saving states, the best first."""
 
 _EXCITATION = 0.01
-"""Of an input's size: at an equilibrium nothing moves, and a slave that rests shows nothing."""
+"""Fraction of an input's size by which trials move it: a slave at rest would show nothing."""
 
 _GOLDEN = 0.6180339887498949
 """Inputs are moved by different parts of that, from half of it to all: what a slave makes of them
@@ -64,7 +64,7 @@ _NAMED = 3
 
 
 class Remedy(NamedTuple):
-    """What an examination calls for.
+    """Consequences of an examination.
 
     Attributes:
         configuration: the slave is to be loaded like this.
@@ -78,7 +78,7 @@ class Remedy(NamedTuple):
 
 
 def is_to_be_examined(description: SlaveDescription, system: System) -> bool:
-    """Whether trial steps of a slave can tell anything: a Python model is known to be exact."""
+    """True if trial steps of a slave can tell anything: a Python model is known to be exact."""
     if description.kind == "Python model":
         return False
     return (
@@ -199,7 +199,7 @@ def _trial_step_size(
 
 
 def _judged(reply: Reply) -> Examination:
-    """What a slave showed; an error on the way is a verdict too."""
+    """Examination of a slave; an error on the way is a verdict too."""
     examination = next((r for r in reply.results if isinstance(r, Examination)), None)
     error = reply.error
     if error is None:

@@ -85,7 +85,7 @@ def initialize(
 def _initialize(
     part: SlavePart, recorded: tuple[str, ...], system: System, may_return_early: bool
 ) -> Initialize:
-    """What a slave is told; it returns early at an event only if it can go back before it."""
+    """Call that initializes a slave, which returns early at events only if it can go back."""
     simulation = system.simulation
     return Initialize(
         start_time=float(simulation.start_time),

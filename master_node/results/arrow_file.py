@@ -31,7 +31,7 @@ _TYPES: Mapping[DiscreteType, pa.DataType] = {
     "binary": pa.binary(),
 }
 BROKEN = (pa.ArrowException, OSError, UnicodeDecodeError)
-"""What Arrow raises for bytes that it cannot read."""
+"""Exceptions of Arrow for bytes that it cannot read."""
 
 _END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
 """A continuation mark and no metadata: the end of a stream (Arrow columnar format, IPC)."""
@@ -199,7 +199,7 @@ def _cut(path: Path, schema: pa.Schema, head: bytes, rows: int) -> int:
 
 
 def columns_of(schema: pa.Schema, path: Path) -> Columns:
-    """What a schema says of the columns.
+    """Columns that a schema describes.
 
     Floats are outputs unless they are said to be discrete; everything else is discrete.
 

@@ -28,7 +28,7 @@ DTYPES: Mapping[DiscreteType, np.dtype[Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """What stands beside ``time`` [s], in this order.
+    """Columns beside ``time`` [s], in this order.
 
     Attributes:
         names, units: of the m outputs; "" where no unit is known.
@@ -69,7 +69,7 @@ class Columns:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What is known of columns before a file is read that does not tell itself.
+    """Units and types of columns that a file to be read does not tell itself.
 
     Attributes:
         units: by name.
@@ -100,7 +100,7 @@ class Known:
         )
 
     def columns(self, names: Sequence[str]) -> Columns:
-        """Of a file with these names beside ``time``."""
+        """Columns of a file with these names beside ``time``."""
         outputs = tuple(name for name in names if name not in self.types)
         discrete = tuple(name for name in names if name in self.types)
         return Columns(

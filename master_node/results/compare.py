@@ -1,4 +1,4 @@
-"""How far two results are apart, variable by variable.
+"""Differences of two results, variable by variable.
 
 Points of time that both results have are compared as they are. Where only the first one has a
 point, the second is interpolated there by ``scipy.interpolate.PchipInterpolator``, a piecewise
@@ -51,7 +51,7 @@ class VariableComparison:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """How far a and b are apart; b is the reference.
+    """Differences of a and b; b is the reference.
 
     Attributes:
         a, b: where they were read from.
@@ -84,7 +84,7 @@ class Comparison:
 
     @property
     def interpolation(self) -> str:
-        """What was done about different points of time."""
+        """Sentence on what was done about different points of time."""
         if not self.interpolated_points:
             return "no interpolation"
         return f"{self.interpolated_points} of them interpolated (PCHIP)"

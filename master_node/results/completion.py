@@ -1,4 +1,4 @@
-"""What is made of the rows of a run that has ended: Parquet, MAT, and the summary.
+"""Completion of the results of a run that has ended: Parquet, MAT, and the summary.
 
 To make Parquet and MAT can take long. Until they are there ``.end.json`` holds the summary of a run
 that got to its end, and all its rows are on the disk: `complete` needs nothing else, and can begin
@@ -74,7 +74,7 @@ def finish(directory: Path) -> bool:
 
 
 def is_complete(directory: Path) -> bool:
-    """Whether the run in the directory got to its end, and nothing lacks in its results.
+    """True if the run in the directory got to its end, and nothing lacks in its results.
 
     Raises:
         ResultsError: the summary is malformed.
@@ -103,7 +103,7 @@ def convert(directory: Path, settings: Mapping[str, Any]) -> None:
 
 
 def failed(summary: Mapping[str, Any], error: ResultsError) -> dict[str, Any]:
-    """The same summary of a run whose results cannot be completed now."""
+    """Summary changed to that of a run whose results cannot be completed now."""
     return {**summary, "outcome": str(Outcome.FAILED), "message": str(error)}
 
 
@@ -118,7 +118,7 @@ def _how_to_go_on(directory: Path) -> str:
 
 
 def _tidy(directory: Path) -> None:
-    """What nothing is made from any more; ``.end.json`` first, as it needs the others."""
+    """Remove files that are no longer needed; ``.end.json`` first, as it needs the others."""
     for name in (END_FILE, STREAM_FILE, START_FILE):
         with suppress(OSError):
             (directory / name).unlink(missing_ok=True)

@@ -165,7 +165,7 @@ def _characters(texts: Sequence[str]) -> NDArray[np.bytes_]:
 
 
 def _write_header(file: BinaryIO, name: str, rows: int, columns: int) -> None:
-    """Of a full matrix of doubles, whose numbers follow column by column.
+    """Header of a full matrix of doubles, whose numbers follow column by column.
 
     SciPy would want all of them at once.
     """
@@ -247,6 +247,6 @@ def _typed(values: FloatArray, dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def _unit(description: str) -> str:
-    """What stands in the last brackets, without the unit for display and Dymola's marks."""
+    """Unit in the last brackets, without the unit for display and Dymola's marks."""
     found = re.search(r"\[([^\[\]]*)\]$", description.strip())
     return re.split(r"[|:]", found[1])[0].strip() if found else ""

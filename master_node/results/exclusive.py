@@ -15,7 +15,7 @@ from protocol.host.directory_locks import lock_directory
 def exclusive(directory: Path) -> Iterator[None]:
     """Keep other runs out of a results directory, in this process and in others of this host.
 
-    Where the file system has no locks, or the directory is not there, nobody is kept out.
+    Where the file system has no locks, or the directory is not there, no other process is kept out.
 
     Raises:
         ResultsError: another run is writing into it.

@@ -82,7 +82,7 @@ class BatchFile(ABC):
 
     @abstractmethod
     def _batch(self) -> bytes:
-        """What is to be written next."""
+        """Bytes to be written next."""
 
     @abstractmethod
     def _written(self) -> None:

@@ -1,4 +1,4 @@
-"""What a run gave, from memory or read back from its files."""
+"""Result of a run, from memory or read back from its files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result:
-    """What a run gave. ``result["wheel.x"]`` is a variable over ``result.time``.
+    """Result of a run. ``result["wheel.x"]`` is a variable over ``result.time``.
 
     Attributes:
         names: ``slave.variable`` of the m outputs.

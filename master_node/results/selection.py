@@ -43,7 +43,7 @@ def check_variables(
 
 
 class SelectionMemory(NamedTuple):
-    """What the choice of points remembers.
+    """Memory of the choice of points.
 
     Attributes:
         number: of points after the first.
@@ -83,7 +83,7 @@ class SelectedResults:
 
     @property
     def memory(self) -> SelectionMemory:
-        """What is remembered by now."""
+        """Memory of the choice by now."""
         return SelectionMemory(self._number, self._passed_over)
 
     def started(self, start: RunStart) -> None:

@@ -185,5 +185,5 @@ def _what(program: Sequence[Call]) -> str:
 
 
 def _plain(value: object) -> object:
-    """As JSON knows it."""
+    """Value as JSON knows it."""
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -86,7 +86,7 @@ class ResultsWriter:
 
     @property
     def rows(self) -> tuple[int, int]:
-        """How many of results and of steps were told so far."""
+        """Number of rows of results, and of steps, that were told so far."""
         return self._points, self._attempts
 
     def synchronize(self) -> None:
@@ -153,7 +153,7 @@ class ResultsWriter:
         """Write what is left, the formats that are made at the end, and the summary.
 
         Raises:
-            ResultsError: a file cannot be written and nobody was told so before.
+            ResultsError: a file cannot be written, and that was not raised before.
         """
         if self._start is None:
             return
@@ -246,7 +246,7 @@ class ResultsWriter:
 
 
 def _errors_of(*actions: Callable[[], None]) -> list[ResultsError]:
-    """Of actions that all get their chance: the disk may have room for one and not for another."""
+    """Errors of actions, which are all tried: the disk may have room for one of them only."""
     errors = []
     for action in actions:
         try:

@@ -54,7 +54,7 @@ _counters = attrgetter(*_COUNTERS)
 
 
 class ResultPosition(NamedTuple):
-    """How much of a run is in its result files.
+    """Extent of a run in its result files.
 
     Attributes:
         points: rows of results, T_0 among them.
@@ -71,7 +71,7 @@ class ResultFiles(Protocol):
     """Where results go to."""
 
     def position(self) -> ResultPosition:
-        """How much was told so far."""
+        """Extent of what was told so far."""
         ...
 
     def flush(self) -> None:
@@ -81,7 +81,7 @@ class ResultFiles(Protocol):
 
 @dataclass(frozen=True)
 class Resumed:
-    """What a checkpoint says of the run.
+    """Checkpoint's record of the run.
 
     Attributes:
         checkpoint: as it was read.
@@ -109,7 +109,7 @@ class Resumed:
 
     @property
     def rows(self) -> tuple[int, int]:
-        """How many rows of results and of steps count."""
+        """Number of rows of results, and of steps, that count."""
         return self.files.points, self.files.attempts
 
     def place(self, kind: type[_T]) -> tuple[_T, ResultMemory]:
@@ -194,7 +194,7 @@ class Checkpoints:
             self._store.begin()
 
     def restarts(self) -> dict[str, int]:
-        """How often each slave was started again."""
+        """Number of restarts of each slave."""
         return {slave.name: slave.restarts for slave in self._slaves}
 
     def settle(self) -> None:

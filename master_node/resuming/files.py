@@ -46,7 +46,7 @@ _MALFORMED = (*UNREADABLE, LookupError, TypeError, AttributeError, OverflowError
 
 
 class SavedSlave(NamedTuple):
-    """How to bring a slave to where the run stood.
+    """Recipe that brings a slave to where the run stood.
 
     Attributes:
         state: to begin with, or None.
@@ -81,7 +81,7 @@ class Checkpoint:
 
 @dataclass
 class _CallsFile:
-    """How much of a file of calls counts.
+    """Part of a file of calls that counts.
 
     Attributes:
         first: number of its first step.

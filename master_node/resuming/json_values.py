@@ -21,7 +21,7 @@ _NUMPY_SCALARS = {"float64": np.float64, "int64": np.int64, "bool": np.bool_}
 
 
 def to_plain(value: Any) -> Any:
-    """As dicts, lists, numbers and texts.
+    """Plain form of a value: dicts, lists, numbers and texts.
 
     Raises:
         TypeError: there is no such form.
@@ -93,7 +93,7 @@ def _built(kind: Any, plain: Any) -> Any:
 
 
 def _expanded(kind: Any) -> Any:
-    """What an alias stands for; ``NDArray`` is one since NumPy 2.5, from Python 3.12 on."""
+    """Type that an alias stands for; ``NDArray`` is one since NumPy 2.5, from Python 3.12 on."""
     alias = get_origin(kind) or kind
     if not hasattr(alias, "__value__"):
         return kind
@@ -109,7 +109,7 @@ def _of_union(kinds: tuple[Any, ...], plain: Any) -> Any:
 
 
 def _leaf(plain: Any) -> Any:
-    """Of which the plain form itself tells the type; tuples of them are lists."""
+    """Types that their plain form itself tells; tuples of them are lists."""
     if plain is None or type(plain) in _SCALARS:
         return plain
     if isinstance(plain, list):

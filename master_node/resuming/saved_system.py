@@ -1,4 +1,4 @@
-"""What a checkpoint says of the system that was run, and whether it still is the same."""
+"""System of a checkpoint, and whether the system of today still is that one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from protocol.host.files import file_sha256
 
 
 class RunMode(NamedTuple):
-    """How slaves are run.
+    """Options of a run that are no settings of the system: how slaves are run.
 
     Attributes:
         in_process: in this process, without a bus.
@@ -27,7 +27,7 @@ class RunMode(NamedTuple):
 
 
 def can_be_saved(system: System) -> bool:
-    """Whether a file can say what was run: it cannot hold functions and arrays out of Python."""
+    """True if a file can say what was run: it cannot hold functions and arrays out of Python."""
     settings = [value for value in system.inputs.values() if isinstance(value, InputSettings)]
     return all(isinstance(given, str | None) for s in settings for given in (s.table, s.function))
 
@@ -35,7 +35,7 @@ def can_be_saved(system: System) -> bool:
 def saved_system(
     system: System, mode: RunMode, descriptions: Mapping[str, SlaveDescription]
 ) -> dict[str, Any]:
-    """What was run, as plain data for JSON."""
+    """System and options of a run, as plain data for JSON."""
     tables = system.model_dump(mode="json", by_alias=True, exclude_unset=True, exclude_none=True)
     return {
         "tables": tables,

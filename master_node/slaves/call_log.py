@@ -50,7 +50,7 @@ Calls = tuple[Call, ...]
 
 
 class LoggedStep(NamedTuple):
-    """What a slave did from one communication point to the next.
+    """Step of a slave from one communication point to the next.
 
     Attributes:
         calls: in order.
@@ -117,7 +117,7 @@ class _Kept:
 
 
 class CallLog:
-    """What one slave was told, as far as it still matters.
+    """Log of the calls of one slave, as far as they still matter.
 
     Args:
         is_compact: keep steps as bytes, a third of the memory, at the price of encoding each.
@@ -140,17 +140,17 @@ class CallLog:
 
     @property
     def is_running(self) -> bool:
-        """Whether the slave has left initialization mode."""
+        """True if the slave has left initialization mode."""
         return self._is_running
 
     @property
     def number(self) -> int:
-        """How many steps there were in all."""
+        """Number of all steps."""
         return self._kept.first + len(self._kept.steps)
 
     @property
     def is_complete(self) -> bool:
-        """Whether all steps since T_0 are kept."""
+        """True if all steps since T_0 are kept."""
         return self._kept.first == 0
 
     @property
@@ -160,7 +160,7 @@ class CallLog:
 
     @property
     def present(self) -> LoggedStep:
-        """What was done since the last step that is kept."""
+        """Calls since the last step that is kept."""
         return LoggedStep(tuple(self._present), self.digest(self._outputs))
 
     @property

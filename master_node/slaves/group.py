@@ -144,7 +144,7 @@ class SlaveGroup:
         return error.located(slave=self.names[index], phase=(steps or [program[0].verb])[0])
 
     def execute_all(self, programs: Sequence[Program], time: float) -> list[Reply]:
-        """The same for programs that must succeed as a whole.
+        """Replies to programs that must succeed as a whole.
 
         Raises:
             DoublestepError: also when a slave returned an error.

@@ -1,4 +1,4 @@
-"""How the master reaches one slave: start a program of calls, then collect its reply."""
+"""Link from the master to one slave: start a program of calls, then collect its reply."""
 
 from __future__ import annotations
 

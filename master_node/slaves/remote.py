@@ -31,12 +31,12 @@ _LOSS_MARGIN = 1.0  # who watches the tokens says it earlier, and of whom
 
 
 def orphan_time(reconnect_time: float) -> float:
-    """How long a slave waits for a master that waits ``reconnect_time`` for it [s]."""
+    """Time for which a slave waits for a master that waits ``reconnect_time`` for it [s]."""
     return reconnect_time + _ORPHAN_MARGIN
 
 
 def slave_status(bus: Bus, key: SlaveKey) -> dict[str, StartValue]:
-    """What a slave says of itself."""
+    """Description that a slave gives of itself."""
     return decode_map(bus.caller(key.verb(STATUS), _STATUS_TIME).request(b""))
 
 
@@ -131,7 +131,7 @@ class RemoteSlave:
 
     @property
     def is_present(self) -> bool:
-        """Whether its liveliness token is there."""
+        """True if its liveliness token is there."""
         return self._is_present and self._loss is None
 
     @property

@@ -45,7 +45,7 @@ from protocol.wire.programs import MAX_CALLS
 log = logging.getLogger("master_node")
 
 _TIMES = 3
-"""How often in a row a slave is started again for the same request."""
+"""Number of times in a row that a slave is started again for one request."""
 
 _STATE = 15
 """The number under which states are saved for checkpoints; those of steps begin with 0."""
@@ -80,7 +80,7 @@ class BrokenStepError(StepRejectedError):
 
     @property
     def is_crash(self) -> bool:
-        """Whether the process died by itself."""
+        """True if the process died by itself."""
         return isinstance(self.original, SlaveCrashedError)
 
     def located(
@@ -144,7 +144,7 @@ class RestorableSlave:
 
     @property
     def can_serialize(self) -> bool:
-        """Whether its states can be saved outside of it."""
+        """True if its states can be saved outside of it."""
         return self._can_serialize
 
     # --- requests -------------------------------------------------------------------------------
@@ -214,7 +214,7 @@ class RestorableSlave:
         self.log.note(self._calls, reply.results)
 
     def _can_be_broken(self, failure: DoublestepError) -> bool:
-        """Whether a smaller step may help, or the run can do without: it was on trial."""
+        """True if a smaller step may help, or the run can do without: it was on trial."""
         if self._restart is None or not self.log.is_running or _is_lost(failure):
             return False
         return bool(steps_taken(self._calls)) or any(type(c) is Examine for c in self._calls)
@@ -262,7 +262,7 @@ class RestorableSlave:
         Args:
             state: to begin with, or None.
             first: number of the first of the ``steps``.
-            steps: up to there; those before ``state`` are taken only if it is of no use.
+            steps: up to there; those before ``state`` are taken only if it cannot be used.
 
         Raises:
             DoublestepError: it cannot be restored.
@@ -339,7 +339,7 @@ class RestorableSlave:
 
     def _distrust(self) -> None:
         log.warning(
-            "%s: its saved state is of no use in another process; all its steps are taken again",
+            "%s: its saved state cannot be used in another process; all its steps are taken again",
             self.name,
         )
         self.log.distrust()
@@ -385,7 +385,7 @@ def _execute(link: SlaveLink, calls: Sequence[Call]) -> list[object]:
 
 
 def _is_lost(error: Exception) -> bool:
-    """Whether it is gone for a reason that has nothing to do with the model: its process died, or
+    """True if it is gone for a reason that has nothing to do with the model: its process died, or
     it was given back while we were out of reach.
     """
     return isinstance(error, SlaveLostError | SlaveKilledError | SequenceError)

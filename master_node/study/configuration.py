@@ -236,7 +236,7 @@ class Study(_Table):
         return self
 
     def _mistake(self, values: object) -> str:
-        """What is wrong with the values of a parameter, beside what is in [sample]; or ""."""
+        """Mistake in the values of a parameter, beside what is in [sample]; or ""."""
         match values:
             case Range(number=None) if self.sample is None:
                 return "number is missing, or a [sample] table"
@@ -274,7 +274,7 @@ class Study(_Table):
 
     @property
     def licence_limit(self) -> int | None:
-        """How many runs have their licences at the same time; None: as many as you like."""
+        """Number of runs that have their licences at the same time; None: no limit."""
         needs = self.run.needs
         limits = [self.resources.licences[name] // needs.count(name) for name in needs]
         return min(limits, default=None)

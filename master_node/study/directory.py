@@ -154,7 +154,7 @@ def put_in_place(part: Path, directory: Path) -> None:
 
 
 def is_wanted(path: Path, token: str) -> bool:
-    """Whether the sweep with this token still works in the directory of a study."""
+    """True if the sweep with this token still works in the directory of a study."""
     try:
         return (path / LOCK_FILE).read_text(encoding="ascii") == token
     except (OSError, UnicodeDecodeError):

@@ -27,7 +27,7 @@ MakeRunner = Callable[[StudyDirectory], Runner]
 
 @dataclass(frozen=True)
 class StudyOutcome:
-    """How many runs there are, and what became of them in the end.
+    """Number of runs, and of those that ended in each way.
 
     Attributes:
         runs: of the study.

@@ -1,4 +1,4 @@
-"""What a person at the prompt sees of a study: a bar on the way, a line for each failure."""
+"""Progress of a study at the prompt: a bar on the way, a line for each failure."""
 
 from __future__ import annotations
 

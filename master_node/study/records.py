@@ -1,4 +1,4 @@
-"""What became of a run: ``run.json`` in its directory, written last.
+"""Record of a run of a study: ``run.json`` in its directory, written last.
 
 Where it is, the run has ended by itself. A run that was interrupted leaves none.
 """
@@ -17,7 +17,7 @@ LOG_FILE = "run.log"
 
 @dataclass(frozen=True)
 class RunRecord:
-    """How a run ended.
+    """Outcome of a run.
 
     Attributes:
         fingerprint: of what was run, see `PlannedRun`.
@@ -35,7 +35,7 @@ class RunRecord:
 
     @property
     def is_completed(self) -> bool:
-        """Whether its results are whole."""
+        """True if its results are whole."""
         return self.outcome == "completed"
 
 

@@ -19,7 +19,7 @@ from protocol.host.python_processes import python_command
 from protocol.host.scratch import ScratchDirectory
 
 END_TIME = 0.2
-"""How long an interrupted run has to end by itself [s]; nothing that it wrote is kept."""
+"""Time in which an interrupted run has to end by itself [s]; nothing that it wrote is kept."""
 
 _LATE_TIME = 2.0
 _KILL_TIME = 5.0
@@ -92,7 +92,7 @@ class RunProcess:
         return words
 
     def poll(self) -> RunRecord | None:
-        """What became of the run, which is in its place then; None while it goes on.
+        """Record of the run, which is in its place then; None while it goes on.
 
         Raises:
             ResultsError: its directory cannot be written.

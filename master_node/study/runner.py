@@ -1,4 +1,4 @@
-"""Who executes the runs of a study: `LocalRunner` here, `DaskRunner` in ``dask_runner.py``."""
+"""Runners of the runs of a study: `LocalRunner` here, `DaskRunner` in ``dask_runner.py``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Runner(ABC):
     @property
     @abstractmethod
     def has_room(self) -> bool:
-        """Whether one more run can be started now."""
+        """True if one more run can be started now."""
 
     @abstractmethod
     def start(self, task: RunTask) -> None:

@@ -1,4 +1,4 @@
-"""What is wrong on the bus, and what to do about it."""
+"""Diagnosis of a bus: problems and their remedies."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was seen.
+    """Diagnosis of the bus.
 
     Attributes:
         windows: where was looked.

@@ -1,4 +1,4 @@
-"""What ``master-node list`` shows."""
+"""Tables of ``master-node list``."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def listing_tables(participants: Sequence[Participant]) -> list[Table]:
 
 
 def listing_data(participants: Sequence[Participant]) -> dict[str, list[dict[str, object]]]:
-    """The same as plain data, with times in seconds since 1970."""
+    """Participants as plain data, with times in seconds since 1970."""
     data: dict[str, list[dict[str, object]]] = {
         kind: [] for kind in ("slaves", "agents", "runs", "routers", "silent")
     }

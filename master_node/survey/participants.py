@@ -1,4 +1,4 @@
-"""Who is on the bus, and what each says of itself."""
+"""Participants on the bus, and their status."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _asked(group: Sequence[tuple[Key, Bus]]) -> Iterator[Participant]:
 
 @dataclass(frozen=True)
 class Timing:
-    """Of status queries.
+    """Times of status queries.
 
     Attributes:
         asked: how many there were.

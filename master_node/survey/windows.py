@@ -31,7 +31,7 @@ class Window:
     Attributes:
         endpoint: where it was looked.
         listens: others come to us there, instead of us to them.
-        bus: opened; None: nobody was reached.
+        bus: opened; None: no participant was reached.
         failure: why not.
     """
 

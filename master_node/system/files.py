@@ -41,7 +41,7 @@ _SSP_SUFFIXES = (".ssp", ".ssd")
 
 @dataclass(frozen=True)
 class ImportedSystem:
-    """What an SSP file says.
+    """Content of an SSP file.
 
     Attributes:
         system: its models are where they were extracted to.
@@ -86,12 +86,12 @@ def open_system(path: Path | str, *, package_bus: bool = False) -> Iterator[Syst
 
 
 def is_ssp(path: Path) -> bool:
-    """Whether the name of a system means a package, a variant in one, or a description."""
+    """True if the name of a system means a package, a variant in one, or a description."""
     return path.suffix.lower() in _SSP_SUFFIXES
 
 
 def is_package(path: Path) -> bool:
-    """Whether the name of a system means a package, or a variant in one."""
+    """True if the name of a system means a package, or a variant in one."""
     return _package(path)[0].suffix.lower() == ".ssp"
 
 
@@ -296,7 +296,7 @@ def _free_name(model: Path, slave: str, taken: set[str]) -> str:
 
 
 def _tables(system: System) -> dict[str, Any]:
-    """What is set in a system, as plain tables."""
+    """Settings of a system, as plain tables."""
     tables: dict[str, Any] = system.model_dump(
         mode="python", by_alias=True, exclude_unset=True, exclude_none=True
     )

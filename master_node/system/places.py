@@ -8,7 +8,7 @@ from typing import Protocol
 
 
 class Places(Protocol):
-    """What to call the parts of a system."""
+    """Names of the parts of a system in messages."""
 
     def slave(self, name: str) -> str:
         """Where a slave is described."""
@@ -28,11 +28,11 @@ class Places(Protocol):
 
     @property
     def ends(self) -> tuple[str, str]:
-        """What to call the output and the input of a connection."""
+        """Names of the output and the input of a connection."""
         ...
 
     def setting(self, table: str, key: str) -> str:
-        """How to give a key of a table: the object of "give ..."."""
+        """Words for giving a key of a table: the object of "give ..."."""
         ...
 
     @property
@@ -43,7 +43,7 @@ class Places(Protocol):
 
 @dataclass(frozen=True)
 class SystemFilePlaces:
-    """Of a system file, or of a system in Python.
+    """Places of a system file, or of a system in Python.
 
     Attributes:
         source: the file's name.
@@ -84,7 +84,7 @@ class SystemFilePlaces:
 
 @dataclass(frozen=True)
 class SspPlaces:
-    """Of an SSP package or an SSD: its elements, by file and line.
+    """Places of an SSP package or an SSD: its elements, by file and line.
 
     Attributes:
         source: the package.

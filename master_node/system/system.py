@@ -150,7 +150,7 @@ _LONGEST_TIME = 1e30
 """Bounds of the simulated time [s]: fifth powers of step sizes have to be numbers."""
 
 _MAX_POINTS = 1e8
-"""How many results may be asked for by their interval."""
+"""Largest number of results that may be asked for by their interval."""
 
 _PAPER: Mapping[str, Any] = {
     "order": 1,
@@ -161,7 +161,7 @@ _PAPER: Mapping[str, Any] = {
     "initial_history": "rest",
     "coupling": "explicit",
 }
-"""What ``preset = "paper"`` stands for; keys that are given beside it win."""
+"""Settings that ``preset = "paper"`` stands for; keys that are given beside it win."""
 
 
 class SimulationSettings(_Table):
@@ -363,7 +363,7 @@ class SimulationSettings(_Table):
 
     @property
     def rests_before_start(self) -> bool:
-        """Whether the past of the system is that of one at rest."""
+        """True if the past of the system is that of one at rest."""
         if self.initial_history is not None:
             return self.initial_history == "rest"
         return self.order != "auto" or self.estimator == "none"
@@ -449,7 +449,7 @@ class SlaveSettings(_Table):
 
     @property
     def needs_agent(self) -> bool:
-        """Whether an agent has to start it."""
+        """True if an agent has to start it."""
         return self.host is not None or bool(self.requires)
 
 
@@ -522,7 +522,7 @@ class InputRows:
 
 
 class InputSettings(_Table):
-    """What drives an input in ``[inputs]`` unless it is a constant: a table or a function.
+    """Signal of an input in ``[inputs]`` that is no constant: a table or a function.
 
     Attributes:
         table: a file ``.csv``, ``.npy`` or ``.npz``, relative to the system file; in Python also
@@ -563,7 +563,7 @@ class InputSettings(_Table):
         return value
 
     def file(self, base: Path) -> str | None:
-        """What it reads: a table, or a Python file with the function, relative to ``base``.
+        """File that it reads: a table, or a Python file with the function, relative to ``base``.
 
         None where it comes out of a package or from Python, or is not there.
         """
@@ -732,7 +732,7 @@ class System(_Table):
         return self
 
     def with_simulation(self, **settings: Any) -> System:
-        """The same system with other simulation settings; None leaves one as it is.
+        """System with other simulation settings; None leaves one as it is.
 
         A preset here wins over single settings of the system, except for a fixed ``order``.
         """
@@ -745,7 +745,7 @@ class System(_Table):
         return self._with(simulation=simulation)
 
     def with_parameters(self, parameters: Mapping[str, Value]) -> System:
-        """The same system with other start values, by ``slave.variable``; they win over its own.
+        """System with other start values, by ``slave.variable``; they win over its own.
 
         Raises:
             ConfigurationError: there is no such slave, with the nearest names.
@@ -765,12 +765,12 @@ class System(_Table):
         return self._with(slaves=slaves)
 
     def with_slave(self, name: str, **settings: Any) -> System:
-        """The same system with other settings of one slave."""
+        """System with other settings of one slave."""
         changed = self.slaves[name].model_dump(exclude_unset=True) | settings
         return self._with(slaves={**self.slaves, name: changed})
 
     def with_slaves(self, **settings: Any) -> System:
-        """The same system with other settings of all slaves; None leaves one as it is."""
+        """System with other settings of all slaves; None leaves one as it is."""
         given = {name: value for name, value in settings.items() if value is not None}
         slaves = {
             name: slave.model_dump(exclude_unset=True) | given
@@ -779,7 +779,7 @@ class System(_Table):
         return self._with(slaves=slaves)
 
     def with_bus(self, **settings: Any) -> System:
-        """The same system with other bus settings; None and empty ones leave one as it is."""
+        """System with other bus settings; None and empty ones leave one as it is."""
         given = {
             name: value
             for name, value in settings.items()
@@ -788,7 +788,7 @@ class System(_Table):
         return self._with(bus=self.bus.model_dump(exclude_unset=True) | given)
 
     def with_results(self, **settings: Any) -> System:
-        """The same system with other results settings; None and empty ones leave one as it is."""
+        """System with other results settings; None and empty ones leave one as it is."""
         given = {name: value for name, value in settings.items() if value not in (None, ())}
         return self._with(results=self.results.model_dump(exclude_unset=True) | given)
 

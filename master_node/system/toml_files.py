@@ -9,7 +9,7 @@ from protocol.errors import ConfigurationError
 from protocol.host.toml_text import parse_toml
 
 MAX_BYTES = 16 * 2**20
-"""What a file may hold: a thousand times what large systems need."""
+"""Limits of a file: a thousand times what large systems need."""
 
 
 def read_tables(path: Path) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def read_located_tables(path: Path) -> dict[str, Any]:
-    """The same, and where the file is: ``base``, its folder, and ``source``, as it was named.
+    """Tables of a file, and where it is: ``base``, its folder, and ``source``, as it was named.
 
     Raises:
         ConfigurationError: see `read_tables`; or the file itself says where it is.

@@ -1,8 +1,8 @@
-"""What a participant accepts from whom, by the role in the certificate. Zenoh's access control.
+"""Access control: messages that a participant accepts, by the role in the sender's certificate.
 
-Everybody has the same rules, for what comes in. A router passes on what masters and slaves may
-say, so that it is trusted like both. An agent has the role of the slaves that it starts, or that of
-a router if it listens. Who has no certificate of a role is not heard at all.
+All participants have the same rules, for what comes in. A router passes on what masters and slaves
+may say, so that it is trusted like both. An agent has the role of the slaves that it starts, or
+that of a router if it listens. A process without a certificate of a role is not heard at all.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from protocol.bus.room import Room
 from protocol.errors import SlaveLostError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-"""Where a master and slaves that were started by hand meet when nobody says otherwise."""
+"""Where a master and slaves that were started by hand meet by default."""
 
 Handler = Callable[[bytes], bytes]
 """Serves one request. Called by one thread at a time; must not raise."""
@@ -33,7 +33,7 @@ class PendingReply(ABC):
 
         Raises:
             DeadlineError: the timeout passed; the request may still be executed later.
-            SlaveLostError: nobody serves the key, or who did went away before replying.
+            SlaveLostError: the key is not served, or its server went away before replying.
         """
 
 
@@ -81,7 +81,7 @@ class Bus(ABC):
     def serve_here(
         self, key: str, handler: Handler, ready: Callable[[], None], room: Room | None = None
     ) -> None:
-        """The same on the calling thread, for the hot path; returns when the bus is closed.
+        """Query on the calling thread, for the hot path; returns when the bus is closed.
 
         ``ready`` is called once requests to ``key`` will be answered.
         """
@@ -175,7 +175,7 @@ class InProcessBus(Bus):
         """Let the handler of ``key`` answer; raises `SlaveLostError` if there is none."""
         served = self._handlers.get(key)
         if served is None:
-            raise SlaveLostError(f"nobody serves {key}")
+            raise SlaveLostError(f"no participant serves {key}")
         handler, one_at_a_time = served
         with one_at_a_time:
             return handler(payload)
@@ -207,7 +207,7 @@ class _Done(PendingReply):
 
 
 def matches(pattern: str, key: str) -> bool:
-    """Whether ``key`` is one of those that ``pattern`` stands for; ``*`` is any one part."""
+    """True if ``key`` is one of those that ``pattern`` stands for; ``*`` is any one part."""
     chunks, parts = pattern.split("/"), key.split("/")
     return len(chunks) == len(parts) and all(
         chunk in ("*", part) for chunk, part in zip(chunks, parts, strict=True)

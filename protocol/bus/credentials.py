@@ -1,4 +1,4 @@
-"""Who a participant is: a certificate for its role, of the laboratory's own authority.
+"""Credentials of a participant: a certificate for its role, of the laboratory's own authority.
 
 A directory holds ``ca.pem``, and ``ROLE.pem`` with ``ROLE-key.pem`` for each role that this host
 may take. The common name of a certificate is its role: what the others allow depends on it
@@ -20,7 +20,7 @@ AUTHORITY = "ca.pem"
 
 
 class Role(StrEnum):
-    """What a participant is on the bus, and the common name of its certificate."""
+    """Role of a participant on the bus, and the common name of its certificate."""
 
     MASTER = "master"
     SLAVE = "slave"
@@ -60,7 +60,7 @@ class Credentials:
 
     @property
     def certificate(self) -> Path:
-        """Of this role."""
+        """Path of the certificate of this role."""
         return self.directory / f"{self.role}.pem"
 
     @property

@@ -15,7 +15,7 @@ LOOPBACK = "127.0.0.1"
 
 
 class Mode(StrEnum):
-    """How a participant takes part in the bus.
+    """Mode of a participant on the bus.
 
     Peers need a connection to each other. Clients need one to a router, which connects them all.
     """
@@ -104,7 +104,7 @@ def host_of(endpoint: str) -> str:
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint on whose port nobody listens now."""
+    """A loopback endpoint with a port that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

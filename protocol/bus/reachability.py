@@ -20,7 +20,7 @@ _HELLO_TIME = 0.5
 
 
 class Reach(StrEnum):
-    """What became of an attempt to connect."""
+    """Result of an attempt to connect."""
 
     REACHED = "reached"
     NOT_REACHED = "not reached"
@@ -76,7 +76,7 @@ def probe(endpoint: str, credentials: Credentials | None, timeout: float) -> Pro
     try:
         connection = socket.create_connection((host, port), timeout)
     except OSError as error:
-        cause = f"nobody answers at that address: {error.strerror or error}"
+        cause = f"no answer at that address: {error.strerror or error}"
         return Probe(endpoint, Reach.NOT_REACHED, cause)
     with connection:
         if credentials is None:
@@ -87,7 +87,7 @@ def probe(endpoint: str, credentials: Credentials | None, timeout: float) -> Pro
 def probe_all(
     endpoints: Sequence[str], credentials: Credentials | None, timeout: float
 ) -> list[Probe]:
-    """The same for several endpoints at once, in their order."""
+    """Results for several endpoints at once, in their order."""
     if not endpoints:
         return []
     with ThreadPoolExecutor(min(len(endpoints), _AT_ONCE)) as pool:

@@ -104,7 +104,7 @@ def _tls(credentials: Credentials) -> dict[str, object]:
 
 
 def _secured(endpoints: Endpoints) -> tuple[str, ...]:
-    """What to connect to with a certificate."""
+    """Endpoint to connect to with a certificate."""
     return endpoints.connect if endpoints.credentials is not None else ()
 
 

@@ -1,1 +1,1 @@
-"""What a process needs of its host: clock, files, logs, other processes, terminals."""
+"""Host of a process: clock, files, logs, other processes, terminals."""

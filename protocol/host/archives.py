@@ -28,7 +28,7 @@ MAX_RATIO = 200
 MAX_XML_BYTES = 64 * 2**20
 MAX_XML_ELEMENTS = 1_000_000
 MAX_XML_ATTRIBUTES = 64
-"""Of one element."""
+"""Largest number of attributes of one element."""
 
 MAX_XML_DEPTH = 100
 _RATIO_FREE_BYTES = 16 * 2**20

@@ -17,7 +17,7 @@ from protocol.host.threads import start_thread, started
 
 
 class Lock(Protocol):
-    """What is used of `threading.Lock`."""
+    """Part of `threading.Lock` that is used."""
 
     def __enter__(self) -> bool: ...
 
@@ -26,12 +26,12 @@ class Lock(Protocol):
     ) -> None: ...
 
     def locked(self) -> bool:
-        """Whether somebody holds it."""
+        """True if somebody holds it."""
         ...
 
 
 class Condition(Protocol):
-    """What is used of `threading.Condition`."""
+    """Part of `threading.Condition` that is used."""
 
     def __enter__(self) -> bool: ...
 
@@ -44,7 +44,7 @@ class Condition(Protocol):
         ...
 
     def wait_for(self, predicate: Callable[[], object], timeout: float) -> object:
-        """The same until ``predicate`` holds; gives its last value."""
+        """Wait until ``predicate`` holds; gives its last value."""
         ...
 
     def notify_all(self) -> None:
@@ -53,7 +53,7 @@ class Condition(Protocol):
 
 
 class Task(Protocol):
-    """What runs beside the others; what is used of `threading.Thread`."""
+    """Thread: the part of `threading.Thread` that is used."""
 
     def join(self, timeout: float) -> None:
         """Wait until it has ended, at most ``timeout`` seconds."""
@@ -61,7 +61,7 @@ class Task(Protocol):
 
 
 class Timer(Protocol):
-    """What is used of `threading.Timer`."""
+    """Part of `threading.Timer` that is used."""
 
     def cancel(self) -> None:
         """Nothing happens any more, unless it has happened."""

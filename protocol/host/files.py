@@ -23,7 +23,7 @@ FMU_ENTRIES = frozenset(
         *("documentation", "licenses", "terminalsAndIcons", "extra"),
     }
 )
-"""What an FMU has at its root (FMI 2.0, section 2.3; FMI 3.0, section 2.5)."""
+"""Entries at the root of an FMU (FMI 2.0, section 2.3; FMI 3.0, section 2.5)."""
 
 _FIRST_TIME = (1980, 1, 1, 0, 0, 0)
 _UNIX = 3
@@ -31,13 +31,13 @@ _PERMISSIONS = 0o100644 << 16
 
 
 def file_sha256(path: Path) -> str:
-    """Of a file, in lower-case hexadecimal digits; raises `OSError`."""
+    """SHA-256 of a file, in lower-case hexadecimal digits; raises `OSError`."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def is_fmu(model: str, base: Path) -> bool:
-    """Whether a model's name means an FMU: a file ``.fmu``, or the folder of one, unpacked.
+    """True if a model's name means an FMU: a file ``.fmu``, or the folder of one, unpacked.
 
     Args:
         model: as in a system file.
@@ -111,7 +111,7 @@ def as_file(path: Path) -> Iterator[Path]:
 
 
 class _Sink(io.RawIOBase):
-    """What an archive is written to that never goes back."""
+    """Sink that an archive is written to and that never goes back."""
 
     def __init__(self, write: Callable[[bytes], object]) -> None:
         self._write = write

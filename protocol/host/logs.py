@@ -20,15 +20,15 @@ from protocol.text.plain_text import printable
 
 
 class LogFormat(StrEnum):
-    """How a command writes its log."""
+    """Format of a command's log."""
 
     TEXT = "text"
     JSON = "json"
 
 
 FIELDS = ("run", "slave", "request", "phase", "t", "H")
-"""Of a JSON line beside time, level, logger and message, where they are known: id of the run,
-name of the slave, ``claim:sequence``, call, communication point [s], step size [s]."""
+"""Fields of a JSON line beside time, level, logger and message, where they are known: id of the
+run, name of the slave, ``claim:sequence``, call, communication point [s], step size [s]."""
 
 
 _PACKAGES = ("protocol", "slave_node", "master_node")
@@ -107,7 +107,7 @@ def add_log_fields(**fields: object) -> None:
 
 
 def logs_json() -> bool:
-    """Whether this process writes JSON lines."""
+    """True if this process writes JSON lines."""
     return any(isinstance(h.formatter, JsonFormatter) for h in logging.getLogger().handlers)
 
 

@@ -104,7 +104,7 @@ def metrics_served(port: int, host: str, read: Read) -> Iterator[str]:
 
     Args:
         port: to listen on; 0: any that is free.
-        host: address to listen on; there is no encryption and nobody is asked who he is.
+        host: address to listen on; there is no encryption and no authentication.
         read: gives the metrics.
 
     Yields:

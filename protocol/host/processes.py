@@ -41,7 +41,7 @@ class PeerProcess:
 
 
 def is_of_this_host(host: str, pid: int) -> bool:
-    """Whether the system can be asked for a process."""
+    """True if the system can be asked for a process."""
     return host == socket.gethostname() and pid > 0 and os.name == "posix"
 
 

@@ -17,7 +17,7 @@ from protocol.variables import StartValue
 from protocol.wire.keys import check_name
 
 DEFAULT_ORPHAN_TIME: Final = 15.0
-"""How long a slave waits for a master that does not say how long [s]."""
+"""Time for which a slave waits for a master that does not say how long [s]."""
 
 DEFAULT_LOAD_TIMEOUT: Final = 120.0
 """Bound on the loading of a model, unless it is said otherwise [s]."""
@@ -89,7 +89,7 @@ class Claimed:
     pid: int
 
     def to_message(self) -> dict[str, StartValue | None]:
-        """As plain data."""
+        """Status as plain data."""
         return asdict(self)
 
     @classmethod
@@ -144,7 +144,7 @@ class _Status:
     __slots__ = ()
 
     def to_message(self) -> dict[str, StartValue | None]:
-        """As plain data."""
+        """Status as plain data."""
         return asdict(self)  # type: ignore[call-overload,no-any-return]  # of a dataclass below
 
     @classmethod
@@ -167,7 +167,7 @@ class _Status:
 
 @dataclass(frozen=True, slots=True)
 class SlaveStatus(_Status):
-    """What a slave says of itself. Times are seconds since 1970, by its own clock.
+    """Status of a slave. Times are seconds since 1970, by its own clock.
 
     Attributes:
         name, instance: its address.
@@ -177,7 +177,7 @@ class SlaveStatus(_Status):
         state: ``free`` or ``held``.
         busy: whether a request is being executed.
         worker: ``alive`` or ``dead``.
-        holder: the master that holds it, for people; None: nobody.
+        holder: the master that holds it, for people; None: it is free.
         run: id of that master's run.
         held_since: when it was claimed [s].
         since: when it began to serve [s].
@@ -206,7 +206,7 @@ class SlaveStatus(_Status):
 
 @dataclass(frozen=True, slots=True)
 class MasterStatus(_Status):
-    """What a master says of its run. Times are seconds since 1970, by its own clock.
+    """Status of a master and its run. Times are seconds since 1970, by its own clock.
 
     Attributes:
         run: id of the run.
@@ -228,7 +228,7 @@ class MasterStatus(_Status):
 
 @dataclass(frozen=True, slots=True)
 class RouterStatus(_Status):
-    """What a router says of itself. Times are seconds since 1970, by its own clock.
+    """Status of a router. Times are seconds since 1970, by its own clock.
 
     Attributes:
         instance: its address.

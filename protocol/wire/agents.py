@@ -1,4 +1,4 @@
-"""What masters and agents say to each other: messages of ``doublestep/agents/...``.
+"""Messages between masters and agents: messages of ``doublestep/agents/...``.
 
 An agent starts slaves on its host. All these records travel as maps of their fields
 (`protocol.wire.records.encode_record`), which also hold the protocol version.
@@ -29,7 +29,7 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 def is_sha256(text: str) -> bool:
-    """Whether ``text`` is a SHA-256 in lower-case hexadecimal digits."""
+    """True if ``text`` is a SHA-256 in lower-case hexadecimal digits."""
     return _SHA256.fullmatch(text) is not None
 
 
@@ -49,7 +49,7 @@ class Licence:
 
     @property
     def free(self) -> int:
-        """How many more slaves may hold it."""
+        """Number of further slaves that may hold it."""
         return max(0, self.total - len(self.holders))
 
 
@@ -73,7 +73,7 @@ class AgentSlave:
 
 @dataclass(frozen=True, slots=True)
 class AgentStatus:
-    """What an agent says of itself. Times are seconds since 1970, by its own clock.
+    """Status of an agent. Times are seconds since 1970, by its own clock.
 
     Attributes:
         name, instance: its address.
@@ -102,12 +102,12 @@ class AgentStatus:
     time: float
 
     def free(self, licence: str) -> float:
-        """How many more slaves may hold ``licence``, infinity where it is not counted."""
+        """Number of further slaves that may hold ``licence``, infinity where it is not counted."""
         counted = [known.free for known in self.licences if known.name == licence]
         return counted[0] if counted else math.inf
 
     def lacks(self, requires: Mapping[str, str]) -> list[str]:
-        """What it has not of ``requires``, as ``name = value``; all licences may be taken."""
+        """Part of ``requires`` that it has not, as ``name = value``; all licences may be taken."""
         missing = lacking(requires, self.labels, {licence.name for licence in self.licences})
         return [f"{name} = {value}" for name, value in missing.items()]
 
@@ -172,7 +172,7 @@ class Upload:
 
 @dataclass(frozen=True, slots=True)
 class UploadState:
-    """How much of an upload is there.
+    """State of an upload.
 
     Attributes:
         received: length of what is there, from the beginning [bytes].
@@ -243,7 +243,7 @@ class StopRun:
 
 @dataclass(frozen=True, slots=True)
 class OutputRequest:
-    """What became of a slave that was started."""
+    """Output of a slave that was started."""
 
     run: str
     slave: str
@@ -251,7 +251,7 @@ class OutputRequest:
 
 @dataclass(frozen=True, slots=True)
 class SlaveOutput:
-    """What became of it.
+    """Output of a slave.
 
     Attributes:
         exit_code: of its process, negative for a signal; None while it runs.
@@ -286,7 +286,7 @@ Record = (
 def lacking(
     requires: Mapping[str, str], labels: Mapping[str, str], licences: Container[str]
 ) -> dict[str, str]:
-    """What of ``requires`` an agent with these labels and counted licences has not."""
+    """Part of ``requires`` that an agent with these labels and counted licences has not."""
     return {
         name: value
         for name, value in requires.items()

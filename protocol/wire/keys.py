@@ -13,7 +13,7 @@
 
 ``<instance>`` is made anew by each slave or agent process, so that a query can never reach two of
 the same name, nor one that was started again in between. That of a slave which was started for a
-run begins with the id of the run and a dash: it is for that run alone, and nobody finds it by name.
+run begins with the id of the run and a dash: it is for that run alone, and is not found by name.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class SlaveKey:
 
     @property
     def is_of_run(self) -> bool:
-        """Whether it was started for one run; all others are found by name."""
+        """True if it was started for one run; all others are found by name."""
         return "-" in self.instance
 
     @staticmethod

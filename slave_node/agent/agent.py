@@ -76,7 +76,7 @@ _CLASS = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 @dataclass(frozen=True)
 class Offer:
-    """What an agent has for masters.
+    """Offer of an agent to masters.
 
     Attributes:
         labels: what it says of its host.
@@ -110,7 +110,7 @@ class Surroundings:
 
 @dataclass
 class _Run:
-    """What was started for a run."""
+    """Slaves that were started for a run."""
 
     slaves: dict[str, tuple[StartSlave, SlaveProcess]] = field(default_factory=dict)
     ending: bool = False
@@ -199,7 +199,7 @@ class Agent:
         self._serve(verb, lambda data: handle(decode_record(cls, data)), room)
 
     def status(self) -> AgentStatus:
-        """What it says of itself."""
+        """Status of the agent."""
         offer = self._offer
         with self._lock:
             running = self._running()
@@ -269,7 +269,7 @@ class Agent:
         return SlaveStarted(process.key.instance, process.pid)
 
     def _known(self, request: StartSlave) -> SlaveProcess | None:
-        """What was started at this very request."""
+        """Slave that was started at this very request."""
         run = self._runs.get(request.run)
         started = run.slaves.get(request.slave) if run else None
         return started[1] if started is not None and started[0] == request else None
@@ -307,7 +307,7 @@ class Agent:
         return Done()
 
     def output(self, request: OutputRequest) -> SlaveOutput:
-        """What became of a slave.
+        """Output and exit code of a slave.
 
         Raises:
             SlaveLostError: no such slave was started, or its run has ended.
@@ -322,7 +322,7 @@ class Agent:
         return SlaveOutput(process.exit_code, process.last_lines(), kept)
 
     def _check(self, request: StartSlave) -> None:
-        """Whether there is what it asks for, now."""
+        """True if there is what it asks for, now."""
         if self._closed:
             raise SlaveLostError("the agent is ending")
         offer = self._offer

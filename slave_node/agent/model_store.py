@@ -53,7 +53,7 @@ class ModelStore:
         self._refused: set[str] = set()
 
     def models(self) -> tuple[AgentModel, ...]:
-        """What is there now, sorted by name. Reads files that are new or were changed.
+        """Models that are there now, sorted by name. Reads files that are new or were changed.
 
         Raises:
             ConfigurationError: the directory cannot be read.
@@ -72,7 +72,7 @@ class ModelStore:
             return tuple(found)
 
     def count(self) -> int:
-        """How many there are; reads no files."""
+        """Number of models; reads no files."""
         with self._lock:
             return len(self._paths())
 
@@ -81,7 +81,7 @@ class ModelStore:
         return next((m.name for m in self.models() if m.sha256 == sha256), None)
 
     def has(self, name: str) -> bool:
-        """Whether there is a file of this name. Raises as `models`."""
+        """True if there is a file of this name. Raises as `models`."""
         with self._lock:
             return any(path.name == name for path in self._paths())
 

@@ -1,4 +1,4 @@
-"""What the command line of an agent means."""
+"""Options of an agent, parsed."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def places_of(
 
 
 def _here(endpoint: str) -> str:
-    """How a process of this host reaches what listens there."""
+    """Address at which a process of this host reaches what listens there."""
     host, port = host_and_port(endpoint)
     host = _ANY.get(host, host)
     return f"{endpoint.partition('/')[0]}/{f'[{host}]' if ':' in host else host}:{port}"

@@ -25,7 +25,7 @@ from protocol.wire.agents import AgentModel, Upload, UploadState, is_sha256
 log = logging.getLogger("slave_node")
 
 _IDLE_TIME = 600.0
-_GIVEN_UP_TIME = 10.0  # then an upload is in nobody's way any more
+_GIVEN_UP_TIME = 10.0  # then an upload no longer takes the room of another
 _STALE_TIME = 86400.0
 MAX_PARTS = 16
 _SUFFIX = ".fmu"
@@ -248,7 +248,7 @@ class UploadCache:
         return files
 
     def _remove_stale(self) -> None:
-        """What processes left behind that were killed."""
+        """Remove files that killed processes have left behind."""
         for path in self.directory.glob(f"*{_PART_SUFFIX}"):
             if time.time() - path.stat().st_mtime > _STALE_TIME:
                 path.unlink(missing_ok=True)

@@ -35,12 +35,12 @@ def agent(  # noqa: PLR0917  options of the command line
     ] = "",
     label: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="What this host has; may be repeated."),
+        typer.Option(metavar="NAME=VALUE", help="Property of this host; may be repeated."),
     ] = None,
     licence: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=COUNT", help="How many slaves may hold a licence; may be repeated."
+            metavar="NAME=COUNT", help="Number of slaves that may hold a licence; may be repeated."
         ),
     ] = None,
     allow_upload: Annotated[
@@ -51,17 +51,21 @@ def agent(  # noqa: PLR0917  options of the command line
     ] = 500,
     cache: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Keeps what was sent [default: in the user's cache]."),
+        typer.Option(
+            metavar="DIR", help="Directory for FMUs that were sent [default: in the user's cache]."
+        ),
     ] = None,
     cache_limit: Annotated[
-        int, typer.Option(metavar="MB", min=1, help="How much is kept of what was sent.")
+        int, typer.Option(metavar="MB", min=1, help="Largest size of all sent FMUs together.")
     ] = 5000,
     allow_python: Annotated[
         bool, typer.Option("--allow-python", help="Start Python models that masters name.")
     ] = False,
     logs: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Keep what the slaves say [default: until they end]."),
+        typer.Option(
+            metavar="DIR", help="Directory that keeps output of slaves [default: none is kept]."
+        ),
     ] = None,
     connect: Annotated[
         list[str] | None,

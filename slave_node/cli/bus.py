@@ -68,7 +68,9 @@ def check(  # noqa: PLR0917  options of the command line
     ] = DEFAULT_ENDPOINT,
     insecure: Insecure = False,
     tls: Tls = None,
-    timeout: Annotated[float, typer.Option(min=0.1, help="For the connection [s].")] = 3.0,
+    timeout: Annotated[
+        float, typer.Option(min=0.1, help="Bound on the wait for the connection [s].")
+    ] = 3.0,
 ) -> None:
     """Exit code 0 if NAME serves, 3 if not: for health checks of service managers."""
     from protocol.bus.zenoh import ZenohBus

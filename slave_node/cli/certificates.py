@@ -14,7 +14,8 @@ from protocol.host.terminal import say
 
 def certificates(
     directory: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Where the authority is, or will be.")
+        Path,
+        typer.Argument(metavar="DIR", help="Directory of the authority, made if it is not there."),
     ],
     host: Annotated[
         list[str],
@@ -24,7 +25,7 @@ def certificates(
         ),
     ],
     role: Annotated[
-        list[Role] | None, typer.Option(help="What the hosts may be [default: slave].")
+        list[Role] | None, typer.Option(help="Role that the hosts may have [default: slave].")
     ] = None,
     days: Annotated[
         int, typer.Option(min=1, max=3650, help="Validity of host certificates.")

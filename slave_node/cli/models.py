@@ -36,7 +36,8 @@ def inspect(
 def validate(
     model: Model,
     step_size: Annotated[
-        float | None, typer.Option(help="Of the trial steps [s] [default: the model's, or 0.01].")
+        float | None,
+        typer.Option(help="Size of the trial steps [s] [default: the model's, or 0.01]."),
     ] = None,
     timeout: Annotated[float, typer.Option(help="Bound on each trial [s].", min=0.1)] = 60.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
@@ -64,7 +65,7 @@ def validate(
 
 
 def _finite(value: Any) -> Any:
-    """The same with texts for the numbers that JSON does not have."""
+    """Value with texts for the numbers that JSON does not have."""
     match value:
         case dict():
             return {key: _finite(item) for key, item in value.items()}

@@ -22,14 +22,14 @@ Insecure = Annotated[bool, typer.Option("--insecure", help="Allow addresses othe
 
 Tls = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Certificates: encrypt, and let in only who has one."),
+    typer.Option(metavar="DIR", help="Certificates: encrypt, and accept only peers that have one."),
 ]
 
-LogStyle = Annotated[LogFormat, typer.Option(help="Of messages.")]
+LogStyle = Annotated[LogFormat, typer.Option(help="Format of messages.")]
 
 
 class BusMode(StrEnum):
-    """How a slave or an agent takes part in the bus; a router is a command of its own."""
+    """Mode of a slave or an agent on the bus; a router is a command of its own."""
 
     PEER = Mode.PEER
     CLIENT = Mode.CLIENT

@@ -60,10 +60,11 @@ def serve(  # noqa: PLR0917  options of the command line
     tls: Tls = None,
     mode: BusModeOption = BusMode.PEER,
     metrics_port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Serve metrics for Prometheus there.")
+        int | None,
+        typer.Option(min=0, max=65535, help="Port of metrics for Prometheus."),
     ] = None,
     metrics_host: Annotated[
-        str, typer.Option(help="Address for that; nobody is asked who he is.")
+        str, typer.Option(help="Address for metrics, without authentication.")
     ] = LOOPBACK,
     log_format: LogStyle = LogFormat.TEXT,
     fmi_logging: Annotated[
@@ -157,7 +158,7 @@ def serve(  # noqa: PLR0917  options of the command line
 
 
 def _counting(worker: Worker, name: str, stack: ExitStack, port: int, host: str) -> Worker:
-    """The same worker, counted; its numbers are served while ``stack`` lasts."""
+    """Worker that is counted; its numbers are served while ``stack`` lasts."""
     from protocol.host.metrics import metrics_served
     from slave_node.serving.metrics import CountingWorker
 

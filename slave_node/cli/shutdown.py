@@ -31,6 +31,6 @@ def end_with_parent(end: Callable[[str], None]) -> None:
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 4096):
             pass
-        end("who started this slave is done or gone")
+        end("the process that started this slave has ended")
 
     start_thread(watch, "parent")

@@ -224,7 +224,7 @@ def _with_steps_of_any_size(
 
 
 def _poor_derivatives(trial: Trial, origin: Place, *, repeat: bool) -> dict[str, str]:
-    """The outputs whose derivatives are of no use; ``repeat``: whether they did so far."""
+    """The outputs whose derivatives cannot be used; ``repeat``: whether they did so far."""
     if not repeat:
         return trial.of_all("others when the same step is taken again")
     if not trial.reads_slopes:

@@ -115,7 +115,7 @@ class Executor:
 
     @property
     def description(self) -> SlaveDescription:
-        """Of the slave."""
+        """Description of the slave."""
         return self._slave.description
 
     @property
@@ -125,7 +125,7 @@ class Executor:
 
     @property
     def saved_states(self) -> int:
-        """How many states are saved now."""
+        """Number of states that are saved now."""
         return len(self._snapshots)
 
     def execute(self, calls: Sequence[Call]) -> Reply:

@@ -1,4 +1,4 @@
-"""How a process that held a model died, as an error, and whether the model did it.
+"""Death of a process that held a model, as an error, and whether the model did it.
 
 A step is rejected, and tried smaller, only for a death that is known to be the model's own doing.
 Any other one, and one of which nothing is known, changes nothing: the slave is restored.
@@ -39,7 +39,7 @@ def death(exit_code: int | None) -> SlaveCrashedError:
 
 
 def how_ended(exit_code: int | None) -> str:
-    """How a process with this exit code ended, in a few words."""
+    """End of a process with this exit code, in a few words."""
     if exit_code is None:
         return "is gone, and nothing tells why"
     if exit_code >= 0:

@@ -74,7 +74,7 @@ Evaluation = Callable[[float, Any, Any], None]
 
 
 class Outcome(Enum):
-    """How an internal step ended."""
+    """End of an internal step."""
 
     STEP = auto()
     STOP = auto()

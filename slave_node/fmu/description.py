@@ -260,7 +260,7 @@ def _hidden(variables: Variables) -> tuple[str, ...]:
 
 
 def _remarks(directory: Path, model_description: Any, interface: Interface) -> tuple[str, ...]:
-    """What of the FMU is not carried, and what it needs."""
+    """Remarks on what of the FMU is not carried, and what it needs."""
     remarks = [
         f"clock {v.name} ({v.intervalVariability or 'without interval'}) is ignored"
         for v in model_description.modelVariables

@@ -34,7 +34,7 @@ def slave_module(directory: Path) -> str | None:
 
 
 def log_categories(directory: Path, declared: Sequence[str]) -> tuple[str, ...]:
-    """What an extracted FMU can be asked to log.
+    """Categories that an extracted FMU can be asked to log.
 
     The binary of an FMU in Python gives the text of an exception no category, and keeps it back
     where named ones are asked for only.
@@ -100,7 +100,7 @@ def _search(resources: Path, *, last: bool) -> None:
 
 
 def _import(fmu: Path, module: str, names: set[str]) -> None:
-    """What the FMU's binary will do again, with an error that says why it cannot."""
+    """Import a module as the FMU's binary will, with an error that says why it cannot."""
     try:
         importlib.import_module(module)
     except ModuleNotFoundError as error:

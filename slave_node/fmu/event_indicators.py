@@ -28,7 +28,7 @@ def root_values(indicators: FloatArray, before: FloatArray) -> FloatArray:
 
 
 def make_event(indicators: FloatArray, before: FloatArray) -> bool:
-    """Whether any of the indicators has changed its domain, or has left zero; shapes (n_z,)."""
+    """True if any of the indicators has changed its domain, or has left zero; shapes (n_z,)."""
     changed = (indicators > 0.0) != (before > 0.0)
     left_zero = (before == 0.0) & (indicators != 0.0)
     return bool((changed | left_zero).any())

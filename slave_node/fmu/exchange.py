@@ -22,7 +22,7 @@ VALUES_CALL = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p]
 """Argument types of fmi2GetReal and fmi2SetReal, without the component."""
 
 Bind = Callable[..., Callable[[], int]]
-"""Of a full name, argument types and arguments the call of that function, see
+"""Calls by full name, argument types and arguments, see
 `FmuInstance.bound`."""
 
 DERIVATIVES_CALL = [*VALUES_CALL, ctypes.c_void_p]

@@ -30,7 +30,7 @@ MAX_EVENTS = 10_000
 """In one step: more are a model that stands still at events without end."""
 
 MAX_UPDATES = 1000
-"""Of the discrete states at one event."""
+"""Largest number of updates of the discrete states at one event."""
 
 _STEP_OK = StepStatus.OK
 _BINARY_CALL = [ADDRESS, ctypes.c_size_t, ADDRESS, ADDRESS, ctypes.c_size_t]

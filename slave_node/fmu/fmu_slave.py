@@ -1,4 +1,4 @@
-"""What FMUs have in common as slaves, whatever their version of FMI and their interface.
+"""Slaves of FMUs: what all have in common, whatever their version of FMI and their interface.
 
 Arrays go to and come from buffers that are made once, so that the hot path neither allocates in
 C types nor loops over variables in Python.

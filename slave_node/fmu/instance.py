@@ -62,7 +62,7 @@ class FmuInstance(ABC):
     """
 
     prefix: ClassVar[str]
-    """Of the names of the functions, such as ``fmi2``."""
+    """Prefix of the names of the functions, such as ``fmi2``."""
     platform_folder: ClassVar[str] = PLATFORM_FOLDERS[0]
     value_types: ClassVar[Mapping[VariableType, ValueType]]
     state_functions: ClassVar[tuple[str, str, str]] = ("", "", "")
@@ -175,7 +175,7 @@ class FmuInstance(ABC):
         return partial(function, ADDRESS.from_param(self.component))
 
     def bound(self, name: str, argument_types: Sequence[Any], *arguments: int) -> Callable[[], int]:
-        """The same with all its arguments bound, so that a call has nothing left to convert.
+        """Function with all its arguments bound, so that a call has nothing left to convert.
 
         What the arguments are addresses of must outlive the call.
         """
@@ -218,7 +218,7 @@ class FmuInstance(ABC):
             restore_floating_point()
 
     def value_type(self, kind: VariableType, name: str) -> ValueType:
-        """How a variable called ``name`` is exchanged.
+        """Exchange of a variable called ``name``.
 
         Raises:
             SlaveError: not at all.
@@ -245,7 +245,7 @@ class FmuInstance(ABC):
         return places
 
     def continuous_places(self, names: Sequence[str]) -> list[Place]:
-        """The same for variables that are floating-point numbers.
+        """Exchange of variables that are floating-point numbers.
 
         Raises:
             ModelError: as ``places``, or a variable is of another type.

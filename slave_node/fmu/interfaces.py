@@ -1,4 +1,4 @@
-"""What an FMU declares on how it is run, for each version of FMI."""
+"""Declarations of an FMU on how it is run, for each version of FMI."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def interface_3(model_description: Any, root: Element) -> Interface:
 
 
 def default_step_size(model_description: Any) -> float | None:
-    """Of the default experiment [s], None if there is none."""
+    """Step size of the default experiment [s], None if there is none."""
     experiment = model_description.defaultExperiment
     if experiment is None or experiment.stepSize is None or not float(experiment.stepSize) > 0.0:
         return None
@@ -190,7 +190,7 @@ def _model_exchange(version: int, model_description: Any) -> Interface:
 
 
 def _has_only_continuous_states(model_description: Any) -> bool:
-    """Whether nothing can change at events, so that states and inputs say all."""
+    """True if nothing can change at events, so that states and inputs say all."""
     return not model_description.numberOfEventIndicators and not any(
         v.causality in ("local", "output")
         and v.variability not in ("constant", "fixed")

@@ -66,7 +66,7 @@ _logs: dict[int, FmuLog] = {}
 """By the first argument of the logger: the environment of FMI 2.0, the component of FMI 1.0."""
 
 _instantiating: list[FmuLog] = []
-"""Of the FMU that is being instantiated: one of FMI 1.0 has no component yet."""
+"""Log of the FMU that is being instantiated: one of FMI 1.0 has no component yet."""
 
 
 def _receive(
@@ -82,10 +82,10 @@ def _receive(
 
 
 LOGGER_2 = fmi2CallbackLoggerTYPE(_receive)
-"""One for all and for ever: the proxy that formats the messages knows one logger."""
+"""Logger callback of FMI 2.0, for all FMUs: the proxy that formats messages knows one logger."""
 
 LOGGER_1 = ctypes.cast(LOGGER_2, fmi1CallbackLoggerTYPE)
-"""The same for FMI 1.0."""
+"""Logger callback of FMI 1.0."""
 
 
 def add_proxy(callbacks: Any) -> None:

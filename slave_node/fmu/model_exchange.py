@@ -38,7 +38,7 @@ MAX_EVENTS = 10_000
 """In one communication step: more are a model that stands still at events without end."""
 
 _HALVINGS = 30
-"""Of the slack behind a step, to locate an event in it."""
+"""Number of times that the slack behind a step is halved to locate an event in it."""
 
 _STEPS_WITHOUT_STATES = 20
 """Internal steps in a communication step of a model that has indicators and no states."""
@@ -171,7 +171,7 @@ class ModelExchangeSlave(FmuSlave):
         return terminate
 
     def _changed_domains(self) -> bool:
-        """Whether an event indicator has changed its domain since the last event or point."""
+        """True if an event indicator has changed its domain since the last event or point."""
         if not self._indicator_count:
             return False
         return make_event(self._model.vector("indicators", self._indicator_count), self._indicators)
@@ -229,7 +229,7 @@ class ModelExchangeSlave(FmuSlave):
         raise StepRejectedError(f"more than {MAX_EVENTS} events in one step")
 
     def _reach_event_ahead(self, time: float, slack: float) -> bool:
-        """Whether an event comes within ``slack`` [s] behind the end of a step, at ``time``.
+        """True if an event comes within ``slack`` [s] behind the end of a step, at ``time``.
 
         The FMU then stands at the event, a bit ahead of the communication point. On so short a
         way the states move along their derivatives.

@@ -13,12 +13,12 @@ _LOCATED = 200.0 * sys.float_info.epsilon
 
 
 def meet(one: float, other: float) -> bool:
-    """Whether two times [s] differ by nothing but rounding."""
+    """True if two times [s] differ by nothing but rounding."""
     return abs(one - other) <= 4.0 * math.ulp(max(abs(one), abs(other)))
 
 
 def is_at_border(time: float, begin: float, end: float) -> bool:
-    """Whether an event at ``time`` is one at the begin or the end of a step [s].
+    """True if an event at ``time`` is one at the begin or the end of a step [s].
 
     The master is not told of it: it stands there, or will. A master that was told of an event goes
     back and comes again with a step that ends there; then it lies a bit earlier or later. All this

@@ -16,7 +16,7 @@ MAX_NAMES = 1000
 
 
 class DescriptionCheck(NamedTuple):
-    """What is wrong with modelDescription.xml, and whether names of variables were parsed too."""
+    """Mistakes in modelDescription.xml, and whether names of variables were parsed too."""
 
     problems: tuple[str, ...]
     has_parsed_names: bool

@@ -21,7 +21,7 @@ from slave_node.fmu.variables import Place
 
 @dataclass(frozen=True, slots=True)
 class ValueType:
-    """How the variables of a type are exchanged.
+    """Exchange of the variables of a type.
 
     Attributes:
         function: what stands behind Get and Set in the names of the functions.
@@ -38,10 +38,10 @@ class ValueType:
 
 
 class Caller(Protocol):
-    """What exchanges values: an instance of an FMU."""
+    """Instance of an FMU that exchanges values."""
 
     def value_type(self, kind: VariableType, name: str) -> ValueType:
-        """How a variable called ``name`` is exchanged; SlaveError if not at all."""
+        """Exchange of a variable called ``name``; SlaveError if there is none."""
         ...
 
     def exchange(self, function: str, references: Any, arrays: Sequence[Any], values: int) -> None:
@@ -233,7 +233,7 @@ class DiscreteExchange:
             group.put([checked[i] for i in positions])
 
     def put_changes(self, values: Sequence[StartValue]) -> bool:
-        """The same; returns whether that changes anything in the FMU."""
+        """Set values; returns whether that changes anything in the FMU."""
         checked = self._checked(values, SlaveError)
         is_changed = False
         for group, positions in self._groups:
@@ -300,7 +300,7 @@ _ACCEPTED: Mapping[VariableType, type] = {
 
 
 def _negative(value: StartValue) -> StartValue:
-    """What a negated alias stands for (FMI 1.0)."""
+    """Value of a negated alias (FMI 1.0)."""
     if isinstance(value, bool):
         return not value
     assert isinstance(value, int | float)

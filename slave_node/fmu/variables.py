@@ -153,7 +153,7 @@ def _check_structural_parameters(
 
 
 def _extent(dimension: Any, structural_parameters: Mapping[str, StartValue]) -> int:
-    """Of one dimension of an array."""
+    """Size of one dimension of an array."""
     if dimension.variable is None:
         extent = int(dimension.start)
     else:
@@ -169,7 +169,7 @@ def _element_name(name: str, index: Sequence[int]) -> str:
 
 
 def _declared_name(declared: Any) -> str:
-    """Of the variable that an alias of FMI 3.0 stands for, or its own."""
+    """Name of the variable that an alias of FMI 3.0 stands for, or its own."""
     return str(declared.name if declared.alias is None else declared.alias.name)
 
 

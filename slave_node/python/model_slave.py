@@ -379,7 +379,7 @@ class ModelSlave(Slave):
         return np.array(rows)[:, self._output_columns]
 
     def _evaluate(self, method: str, size: int, t: float, *args: FloatArray) -> FloatArray:
-        """What a method of the model gives, shape (size,); its exceptions as ours."""
+        """Value of a method of the model, shape (size,); its exceptions as ours."""
         try:
             value = np.asarray(self._run(getattr(self._model, method), t, *args), dtype=float)
         except DoublestepError:

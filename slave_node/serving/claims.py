@@ -1,6 +1,6 @@
-"""Who holds the slave, and the guard that lets every request take effect exactly once.
+"""Claim on a slave, and the guard that lets every request take effect exactly once.
 
-A master claims a slave for its run and gets an epoch, a number that nobody can guess; each request
+A master claims a slave for its run and gets an epoch, a number that cannot be guessed; each request
 carries the epoch and a sequence number that grows by one. A repeated number gets the reply that was
 stored, without a second effect; an old epoch is refused. No clock, no bus.
 """
@@ -58,7 +58,7 @@ class Claims:
 
     @property
     def holder(self) -> Holder | None:
-        """Who holds the slave, if anybody."""
+        """Master that holds the slave, or None."""
         return self._holder
 
     @property
@@ -89,10 +89,10 @@ class Claims:
         """Refuse whoever is not the present holder.
 
         Raises:
-            SequenceError: ``epoch`` is not the present one, or nobody holds the slave.
+            SequenceError: ``epoch`` is not the present one, or the slave is not held.
         """
         if self._holder is None or epoch != self._epoch:
-            held = f"held by {self._holder}" if self._holder else "held by nobody"
+            held = f"held by {self._holder}" if self._holder else "not held"
             raise SequenceError(
                 f"the request has epoch {epoch}, which is not the present one ({held}): the slave "
                 "was given back, as its master was out of reach, or claimed again",
@@ -109,7 +109,7 @@ class Claims:
         self._holder = None
 
     def admit(self, epoch: int, sequence: int) -> bytes | None:
-        """Whether to execute the request: None to go ahead, else the reply to give again.
+        """Decision on a request: None to execute it, else the reply to give again.
 
         Raises:
             SequenceError: stale epoch, or neither the last sequence number nor the next.

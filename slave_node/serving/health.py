@@ -1,4 +1,4 @@
-"""Whether a slave, agent or router is there, told by its liveliness token: for service managers."""
+"""Health of a slave, agent or router, told by its liveliness token: for service managers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def check_alive(bus: Bus, name: str, *, agent: bool = False) -> None:
         agent: look for an agent.
 
     Raises:
-        SlaveLostError: nobody has put it up: who it is of has not begun to serve, or is gone.
+        SlaveLostError: the token is not there: its owner has not begun to serve, or is gone.
     """
     alive_named, kind = (alive_agents, "agent") if agent else (alive_slaves, "slave")
     if bus.alive(alive_named(name) if name else alive_routers(), _TOKEN_TIME):

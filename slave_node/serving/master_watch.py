@@ -61,7 +61,7 @@ class _Followed:
 
     @property
     def token(self) -> str:
-        """Of its run."""
+        """Liveliness token of its run."""
         return alive_master(self.master.run)
 
 

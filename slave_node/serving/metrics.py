@@ -1,4 +1,4 @@
-"""What Prometheus can ask of a slave: a worker that counts what goes through it."""
+"""Metrics of a slave, for Prometheus: a worker that counts what goes through it."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ class SlaveNode:
 
     @property
     def busy(self) -> bool:
-        """Whether a request is being executed now."""
+        """True if a request is being executed now."""
         return self._running.locked()
 
     def _announce(self) -> None:
@@ -282,7 +282,7 @@ class SlaveNode:
         return encode_map(status.to_message())
 
     def _free_orphan(self, epoch: int) -> None:
-        """Give a slave back whose master is gone; a step under way is for nobody any more."""
+        """Give a slave back whose master is gone; a step under way has no use any more."""
         holder = self._claims.holder
         try:
             self._claims.check(epoch)

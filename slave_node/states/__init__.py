@@ -1,1 +1,1 @@
-"""How the state of a slave is saved when its model cannot, or shall not, do it itself."""
+"""Saved states of slaves whose models cannot, or shall not, save them themselves."""

@@ -57,7 +57,7 @@ class CallRecord:
         self._discrete: list[tuple[StartValue, ...]] = []
 
     def __len__(self) -> int:
-        """How many calls."""
+        """Number of calls."""
         return len(self._operations)
 
     @property
@@ -126,7 +126,7 @@ class CallRecord:
         return record
 
     def _carried(self, operations: bytes | bytearray) -> tuple[int, int]:
-        """How many numbers, and how many tuples of discrete values, some operations carry."""
+        """Number of numbers, and of tuples of discrete values, that some operations carry."""
         columns = len(self._initialize.inputs)
         numbers = sum(
             operations.count(_SET_INPUTS + order) * (order + 1) * columns

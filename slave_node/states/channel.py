@@ -20,7 +20,7 @@ _CHUNK = 2**20
 
 
 class Message(IntEnum):
-    """What a message is about. Each one that asks is answered by ``DONE`` or ``REFUSED``.
+    """Subject of a message. Each one that asks is answered by ``DONE`` or ``REFUSED``.
 
     ``LOAD``: load the model that a map tells. ``STEP``: take a step, see ``step_message.py``.
     ``PROGRAM``: execute any other calls. ``FORK``: make a copy that serves the socket that
@@ -85,7 +85,7 @@ class Channel:
         return _MESSAGES[kind], self._exactly(size)
 
     def wait(self, timeout: float) -> bool:
-        """Whether a message, or the end, comes within ``timeout`` seconds."""
+        """True if a message, or the end, comes within ``timeout`` seconds."""
         poll = select.poll()
         poll.register(self._socket, select.POLLIN)
         return bool(poll.poll(timeout * 1e3))

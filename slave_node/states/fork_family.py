@@ -51,7 +51,7 @@ class HolderFamily:
         self._deaths: dict[int, int] = {}
         self._obituaries, obituaries = os.pipe()
         os.set_blocking(self._obituaries, False)
-        os.set_blocking(obituaries, False)  # a full pipe holds nobody up
+        os.set_blocking(obituaries, False)  # a full pipe blocks no writer
         descriptors = (theirs.fileno(), obituaries)
         try:
             self._keeper = subprocess.Popen(
@@ -87,7 +87,7 @@ class HolderFamily:
         return Channel(connection, self._check_keeper, _IDLE_TIME)
 
     def _check_keeper(self) -> None:
-        """Without a keeper nobody ends the holders but we."""
+        """Without a keeper only this process ends the holders."""
         if self._keeper.poll() is not None:
             self._kill()
 

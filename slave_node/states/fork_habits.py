@@ -1,7 +1,7 @@
-"""What is likely to be asked of a slave next: what followed the same calls the last time.
+"""Forecast of what is asked of a slave next: what followed the same calls the last time.
 
 A master repeats itself from one double step to the next. Whoever knows what comes can have the copy
-of a process ready before it is asked for, and need not make one that nobody will ask for. To be
+of a process ready before it is asked for, and need not make one that is never asked for. To be
 wrong costs time and nothing else.
 """
 
@@ -13,7 +13,7 @@ _LENGTH = 4
 
 
 class Event(Enum):
-    """What is asked of a slave that matters here.
+    """Event in the life of a slave that matters here.
 
     ``SAVE``, ``RESTORE`` (the state stays saved), ``GIVE_UP`` (it does not), ``STEP``, and ``RUN``:
     any other calls.
@@ -29,8 +29,7 @@ class Event(Enum):
 _BEGINS = frozenset((Event.SAVE, Event.RESTORE, Event.GIVE_UP))
 
 Situation = tuple[int, tuple[Event, ...]]
-"""How many states are saved, and the events back to when one was last saved or restored, at most
-four."""
+"""Number of saved states, and at most four events, back to when one was last saved or restored."""
 
 
 class Habits:
@@ -58,7 +57,7 @@ class Habits:
         return self._followers.get(self.situation)
 
     def note_use(self, situation: Situation, use: Event | None) -> None:
-        """What a state was first used for that was saved in a situation: ``RESTORE``, ``GIVE_UP``.
+        """First use of a state that was saved in a situation: ``RESTORE``, ``GIVE_UP``.
 
         None: it was freed.
         """

@@ -1,4 +1,4 @@
-"""What a forked copy of a process would not have, or would have in common with the original.
+"""Hindrances to forking: what a copy of a process would not have, or would share.
 
 A fork copies memory and one thread. Other threads are missing in the copy; sockets, devices and
 files that are written are the same ones in both, and so is memory that is mapped as shared.
@@ -34,7 +34,7 @@ class ForkHindrances:
         self._was_checked = False
 
     def check(self, ours: AbstractSet[int]) -> list[Reader]:
-        """Whether this process may be forked now.
+        """True if this process may be forked now.
 
         Args:
             ours: descriptors that were opened since and that the model does not know.

@@ -153,14 +153,14 @@ class _Holder:
             self._flush(None)  # what the model has printed is not to be printed by both
             child = os.fork()
         except (OSError, SlaveError) as error:
-            with connection, suppress(OSError):  # nobody wants the copy any more
+            with connection, suppress(OSError):  # the copy is no longer wanted
                 Channel(connection).send(Message.REFUSED, encode_error(_refusal(error)))
             return
         if child:
             connection.close()
             self._children.add(child)
         else:
-            self._channel.close()  # else nobody would notice when the original dies
+            self._channel.close()  # else the death of the original would go unnoticed
             self._channel = Channel(connection)
             self._children = set()
             reopen(readers)

@@ -74,7 +74,7 @@ def _hold(channel: int, obituaries: int) -> None:
 def report(obituaries: int, pid: int, status: int) -> None:
     """Write down how a process died, unless it ended as it should."""
     if status:
-        with suppress(OSError):  # nobody reads them any more
+        with suppress(OSError):  # they are no longer read
             os.write(obituaries, OBITUARY.pack(pid, status))
 
 

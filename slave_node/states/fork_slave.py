@@ -2,7 +2,7 @@
 
 To save is to let the holder fork; the copy waits, frozen, for what never comes unless the state is
 restored. To restore is to go on with the copy; the process that was the slave before ends then.
-What makes that dear is the copies, so that there are as few as can be, and at the best time:
+Copies make that expensive, so that there are as few as can be, and at the best time:
 
 - A copy is asked for and not waited for, and where habit says that one will be needed, beforehand:
   right behind the step before it, so that it is made while the results are on their way.
@@ -63,7 +63,7 @@ _CLOSE_TIME = 0.5
 
 @dataclass(frozen=True, slots=True)
 class HeldModel:
-    """What a holder loads: the arguments of `slave_node.loading.load_model`."""
+    """Model that a holder loads: the arguments of `slave_node.loading.load_model`."""
 
     model: str
     base: Path
@@ -177,7 +177,7 @@ class ForkSlave(Slave):
     def _exchange(
         self, kind: Message, payload: bytes, *, copy_behind: bool = False
     ) -> tuple[Message, bytes]:
-        """What the holder answers; with ``copy_behind`` it then makes a copy.
+        """Answer of the holder; with ``copy_behind`` it then makes a copy.
 
         Raises:
             SlaveCrashedError: it died of that.
@@ -195,7 +195,7 @@ class ForkSlave(Slave):
                 return holder.receive()
             except (EOFError, OSError):
                 raise holder.death() from None
-        except BaseException:  # also Ctrl-C: what it answers would be for nobody
+        except BaseException:  # also Ctrl-C: its answer would have no reader
             self._drop_active()
             raise
 
@@ -351,7 +351,7 @@ class ForkSlave(Slave):
         return result
 
     def _fallen(self, error: SlaveError) -> SlaveError:
-        """What a step that ended the model means for the caller."""
+        """Error for the caller of a step that ended the model."""
         self._drop_active()  # it must not be called any more
         kind = StepRejectedError if self._saved else FatalSlaveError
         return kind(error.cause, remedy=error.remedy)
@@ -473,7 +473,7 @@ class ForkSlave(Slave):
     # ---- Copies -------------------------------------------------------------------------------
 
     def _needs_copy(self) -> bool:
-        """Whether a state that is saved here needs a process of its own."""
+        """True if a state that is saved here needs a process of its own."""
         return self._trail is None or self._habits.use(self._habits.situation) is not None
 
     def _copy_of_active(self, holder: HeldProcess) -> HeldProcess:
@@ -523,7 +523,7 @@ class ForkSlave(Slave):
             self._habits.note_use(state.situation, use)
 
     def _is_latest_for_restores(self) -> bool:
-        """Whether the state saved last, and not yet used, is likely to be restored and kept."""
+        """True if the state saved last, and not yet used, is likely to be restored and kept."""
         state = self._latest
         return (
             state is not None
@@ -553,7 +553,7 @@ class ForkSlave(Slave):
                 self._origin = self._trail = None
 
     def _is_last_of_origin(self, state: _State) -> bool:
-        """Whether no other saved state has the origin of this one."""
+        """True if no other saved state has the origin of this one."""
         return not any(o is not state and o.origin is state.origin for o in self._saved)
 
     def _end_process(self, holder: HeldProcess) -> None:
@@ -579,7 +579,7 @@ def _copy_from_origin(state: _State) -> HeldProcess:
 
 
 def _meet(copy: HeldProcess) -> None:
-    """`HeldProcess.meet`, for one that nobody else knows."""
+    """`HeldProcess.meet`, for one that no other process knows."""
     try:
         copy.meet()
     except BaseException:

@@ -1,4 +1,4 @@
-"""What a process was asked since it was a copy of another, and what it answered.
+"""Trail of a process: calls since it was a copy of another, and their answers.
 
 A copy of the same original that is asked the same stands where that process stands: what steps of
 microseconds have changed is done again sooner than it is copied.
@@ -46,4 +46,4 @@ class Trail(NamedTuple):
 
 
 START = Trail()
-"""Of a copy that was asked nothing yet."""
+"""Trail of a copy that was asked nothing yet."""

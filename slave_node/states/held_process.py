@@ -45,7 +45,7 @@ class HeldProcess:
         self._channel.send(kind, payload)
 
     def receive(self) -> tuple[Message, bytes]:
-        """What it answers.
+        """Answer of the process.
 
         Raises:
             EOFError, OSError: it is gone.
@@ -55,7 +55,7 @@ class HeldProcess:
         return self._channel.receive()
 
     def wait(self, timeout: float) -> bool:
-        """Whether it answers, or is gone, within ``timeout`` seconds."""
+        """True if it answers, or is gone, within ``timeout`` seconds."""
         return self._channel.wait(timeout)
 
     def copy(self) -> HeldProcess:

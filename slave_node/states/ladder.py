@@ -21,7 +21,7 @@ CAN_FORK = sys.platform == "linux"
 
 
 class StateChoice(NamedTuple):
-    """How a state is saved, and why not natively ("" if it is)."""
+    """Way in which a state is saved, and why not natively ("" if it is)."""
 
     kind: StateKind
     reason: str

@@ -81,7 +81,7 @@ def with_outputs(answer: bytes, number: int, change: Callable[[FloatArray], Floa
 
 
 def decode_stepped(answer: bytes, order: int | None) -> tuple[StepResult, FloatArray | None]:
-    """How the step ended, and the outputs if they were asked for and the step is ok."""
+    """Result of the step, and the outputs if they were asked for and the step is ok."""
     status, time = _RESULT.unpack_from(answer)
     result = StepResult(_STATUSES[status], time)
     if order is None or result.status is not StepStatus.OK:

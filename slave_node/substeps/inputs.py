@@ -97,7 +97,7 @@ def _unit(degree: int) -> list[float]:
 
 
 def substeps_needed(rows: FloatArray, nominal: FloatArray, tolerance: float) -> int:
-    """How many equal substeps an accuracy needs, from 1 to `MAX_SUBSTEPS`.
+    """Number of equal substeps that an accuracy needs, from 1 to `MAX_SUBSTEPS`.
 
     k + 1 for the order. And let r be the relative change of an input in the step, |u - u(T)| /
     max(|u(T)|, nominal). A slave whose f depends on u as a square does makes an error of

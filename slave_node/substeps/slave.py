@@ -29,10 +29,10 @@ DEFAULT = Configure()
 _OK = StepStatus.OK
 _DEFAULT_TOLERANCE = 1e-6
 _LAST_SUBSTEP = 1.0 / 16.0
-"""Of an equal substep: how long the one is that outputs with direct feed-through belong to."""
+"""Length of the last substep, for outputs with direct feed-through, in equal substeps."""
 
 _ON_GRID = 1e-9
-"""How far a communication step may be from a whole number of substeps, relative to it."""
+"""Largest distance of a communication step from a whole number of substeps, relative to it."""
 
 _MAGIC = b"2StepSub"
 _HEADER = struct.Struct("<8sHId")  # magic, rows, columns, where the slave stands
@@ -41,7 +41,7 @@ _HEADER = struct.Struct("<8sHId")  # magic, rows, columns, where the slave stand
 def input_derivatives(
     description: SlaveDescription, configuration: Configure = DEFAULT
 ) -> InputDerivatives:
-    """How a model follows polynomial inputs, by itself or with the help of its slave node.
+    """Way in which a model follows polynomial inputs, by itself or with the help of its slave node.
 
     One without input derivatives, or not of all orders, is emulated, unless ``input_substeps`` is
     1. A number that is given holds for a model with input derivatives too.
@@ -89,7 +89,7 @@ class _SavedState:
 
 @lru_cache(maxsize=256)
 def _lengths(number: int, *, meets_end: bool) -> tuple[float, ...]:
-    """Of substeps in units of the step: equal ones, and a short last one if it meets the end."""
+    """Lengths of substeps in steps: equal ones, and a short last one if it meets the end."""
     if not meets_end:
         return (1.0 / number,) * number
     last = _LAST_SUBSTEP / number
@@ -290,7 +290,7 @@ class SubstepSlave(Slave):
         return self._standing if is_there else communication_point
 
     def _split(self, rows: FloatArray | None, step_size: float) -> tuple[int, float | None, bool]:
-        """How many substeps, their size if it is given [s], and whether they may have any other.
+        """Number of substeps, their size if it is given [s], and whether they may have any other.
 
         ``rows`` are those of the polynomial, `scaled`, if it is to be emulated.
         """

@@ -51,7 +51,7 @@ class Pair(NamedTuple):
 
 
 def poor_derivatives(trial: Trial, pair_of: Callable[[float], Pair]) -> dict[str, str]:
-    """The outputs whose derivatives are of no use, with the reason.
+    """The outputs whose derivatives cannot be used, with the reason.
 
     Args:
         trial: of the slave.

@@ -1,4 +1,4 @@
-"""What ``slave-node inspect`` shows."""
+"""Tables of ``slave-node inspect`` and ``validate``."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ _LADDER = (StateKind.NATIVE, StateKind.FORK, StateKind.REPLAY, StateKind.NONE)
 
 
 class Grade(StrEnum):
-    """How a finding is to be read."""
+    """Grade of a finding."""
 
     OK = "ok"
     NOTE = "note"
@@ -524,7 +524,7 @@ def _clocks(reply: Reply) -> tuple[str, ...]:
 
 
 def _reasons(poor: Mapping[str, str]) -> str:
-    """Why the derivatives of outputs are of no use."""
+    """Reason why the derivatives of outputs cannot be used."""
     by_reason: dict[str, list[str]] = {}
     for name, reason in poor.items():
         by_reason.setdefault(reason, []).append(name)
@@ -532,7 +532,7 @@ def _reasons(poor: Mapping[str, str]) -> str:
 
 
 def _is_not_completed(reply: Reply) -> bool:
-    """Whether the last step was rejected or ended early: a run repeats that, smaller."""
+    """True if the last step was rejected or ended early: a run repeats that, smaller."""
     if reply.error is not None:
         return isinstance(reply.error, StepRejectedError)
     return bool(reply.results) and isinstance(reply.results[-1], StepResult)
@@ -555,7 +555,7 @@ def _verdict(what: str, examination: Examination) -> Finding:
 
 
 def _behaviour(examination: Examination, *, takes_any_step: bool) -> Iterator[Finding]:
-    """What was tried with steps of several sizes, if the model takes them."""
+    """Findings of trials with steps of several sizes, if the model takes them."""
     if not takes_any_step:
         return
     clock = examination.internal_clock
@@ -581,10 +581,10 @@ def _behaviour(examination: Examination, *, takes_any_step: bool) -> Iterator[Fi
 
 
 def is_usable(findings: list[Finding]) -> bool:
-    """Whether the model can be run."""
+    """True if the model can be run."""
     return all(finding.grade is not Grade.PROBLEM for finding in findings)
 
 
 def unusable(model: str) -> SlaveError:
-    """What the command ends with otherwise."""
+    """Error with which the command ends for a model that cannot be run."""
     return SlaveError(f"{model} cannot be run", remedy="see the problem in the report")

@@ -66,7 +66,7 @@ class Pipe:
         return size
 
     def has_message(self, timeout: float) -> bool:
-        """Whether a message, or the end, comes within ``timeout`` seconds."""
+        """True if a message, or the end, comes within ``timeout`` seconds."""
         return bool(wait([self._socket], timeout))
 
     def hang_up(self) -> None:

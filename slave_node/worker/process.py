@@ -53,9 +53,10 @@ _PR_SET_PDEATHSIG = 1
 
 @dataclass(frozen=True, slots=True)
 class ModelReference:
-    """What to load: see `slave_node.loading.load_executor`; ``parameters`` are start values that
-    hold unless the master gives others, ``state_kind`` unless it asks for another; ``log_format``
-    is that of the worker's messages.
+    """Reference to a model to load, see `slave_node.loading.load_executor`.
+
+    ``parameters`` are start values that hold unless the master gives others, ``state_kind`` holds
+    unless it asks for another; ``log_format`` is that of the worker's messages.
     """
 
     model: str
@@ -132,7 +133,7 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int | None:
-        """Of the process, None when there is none."""
+        """Process id, None when there is no process."""
         return self._process.pid if self._process else None
 
     def start(self) -> SlaveDescription:
@@ -228,7 +229,7 @@ class WorkerProcess:
         return SlaveKilledError(f"the process that held the model {how_ended(self._exit_code())}")
 
     def _exit_code(self) -> int | None:
-        """Of a process that is dying; None: not known."""
+        """Exit code of a process that is dying; None: not known."""
         assert self._process is not None
         self._wait_ended(self._process, _DEATH_TIME)
         self._process.join(_CLOSE_TIME)

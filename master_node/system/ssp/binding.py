@@ -41,7 +41,7 @@ from protocol.variables import Variable, VariableType
 Describe = Callable[[Path], SlaveDescription]
 
 _MOST_DIMENSIONS = 2
-"""Of an array whose rows a system file can hold; more are given element by element."""
+"""Most dimensions of an array that is given by rows; others are given element by element."""
 
 
 class Given(NamedTuple):

@@ -1,4 +1,4 @@
-"""What several documents of SSP define alike: types with units, enumerations and dimensions."""
+"""Definitions that several documents of SSP have: types with units, enumerations and dimensions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from master_node.system.ssp.xml_nodes import Node, integer, number
 from protocol.text.names import nearest
 
 MAX_ELEMENTS = 100_000
-"""Of one array."""
+"""Largest number of elements of one array."""
 
 _BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 _INTEGERS = tuple(f"{sign}Int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "U"))
@@ -27,7 +27,7 @@ _DIMENSIONS = ("ssc:Dimension", "ssd:Dimension", "ssv:Dimension", "ssb:Dimension
 
 @dataclass(frozen=True, slots=True)
 class Definitions:
-    """Of one document.
+    """Definitions of one document.
 
     Attributes:
         units: by name.

@@ -230,7 +230,7 @@ class _Flattening:
 
 
 def _step(edge: Edge, unit: Unit | None) -> tuple[Linear, Unit | None]:
-    """What one connection does to a value in ``unit``, and the unit behind it."""
+    """Transformation of one connection for a value in ``unit``, and the unit behind it."""
     target = edge.target_connector.unit
     step = Linear()
     if edge.element.suppress_unit_conversion:

@@ -65,7 +65,7 @@ class _End:
 
 
 class SignalGraph:
-    """Who gives a signal to whom.
+    """Graph of the signals between the components.
 
     Args:
         root: the root system.
@@ -132,7 +132,7 @@ class SignalGraph:
         return self._dictionaries[path][0], name
 
     def shown(self, port: Port) -> str:
-        """What to call a port in messages."""
+        """Name of a port in messages."""
         path, name = port
         if "" in path:
             return f"entry {name!r} of signal dictionary {path[-1]!r}"

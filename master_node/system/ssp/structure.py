@@ -1,4 +1,4 @@
-"""What an SSP document says, as plain values: systems, components, connections, parameters.
+"""Content of an SSP document, as plain values: systems, components, connections, parameters.
 
 Words are those of SSP 1.0 and 2.0. Nothing here knows XML or the settings of a run.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 
 Scalar = float | int | bool | str
 Value = Scalar | tuple["Value", ...]
-"""Of a parameter: an array's are its rows, a binary's hexadecimal digits."""
+"""Value of a parameter: an array's are its rows, a binary's hexadecimal digits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class ItemTable:
         return self.entries.get(item, item)
 
     def numbered(self, sources: Mapping[str, int], targets: Mapping[str, int]) -> Table:
-        """The same for the numbers of the items in both enumerations.
+        """Mapping of the numbers of the items in both enumerations.
 
         Raises:
             KeyError: an item is not in its enumeration.
@@ -252,7 +252,7 @@ class Structure:
 
 @dataclass
 class Notes:
-    """What a document holds that is not carried, and what else its user should know.
+    """Notes on what a document holds that is not carried, and what else its user should know.
 
     Attributes:
         source: the file that was asked for.

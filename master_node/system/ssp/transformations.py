@@ -44,7 +44,7 @@ def read_transformation(node: Node) -> Transformation | None:
 
 
 def apply(transformation: Transformation, value: Scalar) -> Scalar:
-    """What becomes of one value; an enumeration's is the name of an item, or its number.
+    """Value behind the transformation; an enumeration's is the name of an item, or its number.
 
     Raises:
         ValueError: the transformation is not for values of that type, or gives no finite number.
@@ -65,7 +65,7 @@ def apply(transformation: Transformation, value: Scalar) -> Scalar:
 
 
 def name_of(transformation: Transformation) -> str:
-    """What it is called in SSP, with an article."""
+    """Name of the transformation in SSP, with an article."""
     match transformation:
         case Linear():
             return "a LinearTransformation"

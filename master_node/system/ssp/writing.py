@@ -30,18 +30,18 @@ from protocol.variables import StartValue, Variable, VariableType
 _Describe = Callable[[str, Path], SlaveDescription]
 _SSD, _SSC, _SSV = (f"{{{NAMESPACES[prefix]}}}" for prefix in ("ssd", "ssc", "ssv"))
 _TIME = (1980, 1, 1, 0, 0, 0)
-"""Of all entries, so that equal systems give equal packages."""
+"""Date of all entries, so that equal systems give equal packages."""
 
 _TYPES = {
     **dict.fromkeys(("Real", "Float32", "Float64"), "Real"),
     **dict.fromkeys(("Integer", "Int8", "UInt8", "Int16", "UInt16", "Int32"), "Integer"),
     **{name: name for name in ("Boolean", "String", "Binary")},
 }
-"""What SSP 1.0 calls the types of variables, as far as it has them."""
+"""Names of types of variables in SSP 1.0, as far as it has them."""
 
 _SMALLEST_INTEGER, _LARGEST_INTEGER = -(2**31), 2**31 - 1
 _KINDS = ("Boolean", "String", "Binary", "Integer", "Int64", "UInt64", "Real")
-"""Of numbers the later one is for all of an array that has both."""
+"""Types; of two for numbers the later one is for all of an array that has both."""
 
 _NUMBERS = frozenset(_KINDS[3:])
 _NOT_IN_1_0 = {f"{_SSC}Dimension", *(f"{_SSV}{sign}Int64" for sign in ("", "U"))}

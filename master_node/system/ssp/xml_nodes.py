@@ -22,7 +22,7 @@ NAMESPACES = {
     "ssm": f"{_SSP}SystemStructureParameterMapping",
     "ssb": f"{_SSP}SystemStructureSignalDictionary",
 }
-"""Of SSP 1.0; 2.0 has kept them."""
+"""Namespaces of SSP 1.0; 2.0 has kept them."""
 
 _PREFIXES = {uri: prefix for prefix, uri in NAMESPACES.items()}
 _SCHEMA_INSTANCE = "{http://www.w3.org/2001/XMLSchema-instance}"
@@ -107,12 +107,12 @@ class Node:
 
     @property
     def text(self) -> str:
-        """What stands between its tags."""
+        """Text between its tags."""
         return self._element.text or ""
 
     @property
     def is_empty(self) -> bool:
-        """Whether it has no children."""
+        """True if it has no children."""
         return len(self._element) == 0
 
     def error(self, cause: str, remedy: str = "") -> ConfigurationError:
@@ -125,7 +125,7 @@ class Node:
         return str(self._element.get(name) or default)
 
     def has(self, name: str) -> bool:
-        """Whether there is an attribute of that name; tools write empty ones for none."""
+        """True if there is an attribute of that name; tools write empty ones for none."""
         return bool(self.attribute(name))
 
     def required(self, name: str) -> str:
