@@ -63,7 +63,8 @@ from protocol.wire.agents import (
 from protocol.wire.keys import MODELS, OUTPUT, START, STOP, UPLOAD, AgentKey, MasterKey, SlaveKey
 from protocol.wire.packing import PROTOCOL_VERSION
 from protocol.wire.records import decode_record, encode_error_map, encode_map, encode_record
-from slave_node.agent.agent import Agent, Offer, Surroundings, upload_cache
+from slave_node.agent import upload_cache
+from slave_node.agent.agent import Agent, Offer, Surroundings
 from slave_node.agent.model_store import ModelStore
 from slave_node.agent.options import default_cache, parse_labels, parse_licences, places_of
 from slave_node.agent.upload_cache import UploadCache

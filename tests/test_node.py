@@ -82,7 +82,7 @@ MODELS = '''
 import os
 import sys
 from protocol.errors import FatalSlaveError
-from protocol.slave import Variable, VariableType
+from protocol.variables import Variable, VariableType
 from slave_node.model import Model, real
 
 class Integrator(Model):

@@ -13,7 +13,7 @@ from master_node.system.files import export_system, open_system
 from protocol.errors import ConfigurationError
 
 LAG = (
-    "from protocol.slave import Variable, VariableType\n"
+    "from protocol.variables import Variable, VariableType\n"
     "from slave_node.model import Model, real\n"
     "class Integrator(Model):\n"
     "    inputs = (real('u', start=0.0),)\n"

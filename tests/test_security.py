@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from master_node import load_system, simulate
-from master_node.hosts.opening import remote as remote_slave
+from master_node.slaves import remote as remote_slave
 from protocol.bus.access import access_control
 from protocol.bus.bus import Bus
 from protocol.bus.credentials import Credentials, Role

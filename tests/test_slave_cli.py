@@ -35,7 +35,7 @@ pytestmark = [
 
 MODELS = """
 import signal
-from protocol.slave import Variable, VariableType
+from protocol.variables import Variable, VariableType
 from slave_node.model import Model, real
 
 class Endless(Model):

@@ -359,7 +359,7 @@ def test_parameters_of_a_served_slave_are_checked_before_it_is_on_the_bus(
 def test_python_models_take_the_same_numbers(tmp_path: Path) -> None:
     """An Integer as 4.0, a truth value as 1."""
     (tmp_path / "counter.py").write_text(
-        "from protocol.slave import Variable, VariableType\n"
+        "from protocol.variables import Variable, VariableType\n"
         "from slave_node.model import Model, real\n"
         "class Counter(Model):\n"
         "    parameters = (\n"
