@@ -9,15 +9,14 @@ if TYPE_CHECKING:
     from master_node.results import Result
     from master_node.simulation import resume, simulate
     from master_node.system.files import open_system
-    from master_node.system.system import (
+    from master_node.system.simulation import SimulationSettings
+    from master_node.system.system import System, load_system
+    from master_node.system.tables import (
         BusSettings,
         Connection,
         InputSettings,
         ResultsSettings,
-        SimulationSettings,
         SlaveSettings,
-        System,
-        load_system,
     )
 
 __all__ = [
@@ -37,17 +36,20 @@ __all__ = [
 
 _ELSEWHERE = {
     "Result": "results",
+    "SimulationSettings": "system.simulation",
+    "System": "system.system",
+    "load_system": "system.system",
     "open_system": "system.files",
     "resume": "simulation",
     "simulate": "simulation",
 }
-"""Modules of what is not in ``system.system``."""
+"""Modules of what is not in ``system.tables``."""
 
 
 def __getattr__(name: str) -> object:
     """Import public names when they are asked for: commands need but a part of them."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_ELSEWHERE.get(name, 'system.system')}"), name)
+    value = getattr(import_module(f"{__name__}.{_ELSEWHERE.get(name, 'system.tables')}"), name)
     globals()[name] = value
     return value

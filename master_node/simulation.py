@@ -48,9 +48,9 @@ from master_node.running.co_simulation import CoSimulation, check_capabilities
 from master_node.slaves.group import SlaveGroup
 from master_node.slaves.restorable import RestorableSlave
 from master_node.slaves.shared_process import Baseline, SharedProcess, shared_process
-from master_node.system.system import InputSettings, System
+from master_node.system.summary import settings_of
+from master_node.system.system import System
 from master_node.system.trust import check_own
-from protocol.description import SlaveDescription
 from protocol.errors import InterruptedRunError
 from protocol.host.new_files import own_folder
 from protocol.host.scratch import ScratchDirectory
@@ -362,34 +362,3 @@ def _logs(directory: Path) -> Path:
         return own_folder(folder)
     except OSError as error:
         raise cannot_write(folder, error) from error
-
-
-def settings_of(system: System, descriptions: Mapping[str, SlaveDescription]) -> dict[str, object]:
-    """All settings of a run as plain data, with the hashes of the models, for ``summary.json``."""
-    settings = system.checked().model_dump(mode="json", by_alias=True)
-    simulation = system.simulation
-    settings["simulation"] |= {
-        "initial_step_size": simulation.given_step_size,
-        "derivative_points": simulation.polynomial.derivative_points,
-        "initial_history": "rest" if simulation.rests_before_start else "none",
-        "smallest_step_size": simulation.smallest,
-        "largest_step_size": simulation.largest,
-        "slave_tolerance": simulation.slave_relative_tolerance,
-    }
-    settings["inputs"] = {
-        name: value.model_dump(mode="json", exclude_unset=True)
-        if isinstance(value, InputSettings)
-        else value
-        for name, value in system.inputs.items()
-    }
-    settings["system_file"] = system.source
-    settings["models"] = {
-        name: {
-            "model": description.model,
-            "kind": description.kind,
-            "sha256": description.sha256,
-            "state_kind": description.state_kind,
-        }
-        for name, description in descriptions.items()
-    }
-    return settings

@@ -27,10 +27,10 @@ from master_node.observing.observers import Observer, Observers
 from master_node.preparing.initialization import initialize
 from master_node.results import Recording
 from master_node.running.co_simulation import CoSimulation, check_capabilities
-from master_node.simulation import settings_of
 from master_node.slaves.group import SlaveGroup
 from master_node.slaves.link import LocalSlave
 from master_node.stepping.double_step import DoubleStep, DoubleStepper
+from master_node.system.summary import settings_of
 from protocol.calls import StepResult, StepStatus
 from protocol.description import Capabilities, InputDerivatives, SlaveDescription, StateKind
 from protocol.signals import InputSignal

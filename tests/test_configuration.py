@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from master_node import BusSettings, ResultsSettings, SimulationSettings, System, load_system
 from master_node.hosts.opening import slaves_on_bus
 from master_node.numerics.extrapolation import InputPolynomial
-from master_node.simulation import settings_of
-from master_node.system.system import OutputTolerance, SlaveSettings
+from master_node.system.summary import settings_of
+from master_node.system.tables import OutputTolerance, SlaveSettings
 from master_node.system.toml_files import MAX_BYTES
 from protocol.errors import ConfigurationError
 from protocol.host.toml_text import toml_value

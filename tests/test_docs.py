@@ -45,16 +45,15 @@ from master_node.study.configuration import (
 from master_node.study.configuration import ResultSettings as StudyResults
 from master_node.study.plan import Plan
 from master_node.study.table import StudyTable
-from master_node.system.system import (
+from master_node.system.simulation import SimulationSettings
+from master_node.system.system import System, load_system
+from master_node.system.tables import (
     BusSettings,
     Connection,
     InputSettings,
     OutputTolerance,
     ResultsSettings,
-    SimulationSettings,
     SlaveSettings,
-    System,
-    load_system,
 )
 from protocol import errors
 from protocol.calls import CALLS

@@ -14,7 +14,9 @@ from master_node.coupling.units import (
     UnknownUnitError,
     conversion,
 )
-from master_node.system.system import Connection, MappingEntries, System
+from master_node.system.fields import MappingEntries
+from master_node.system.system import System
+from master_node.system.tables import Connection
 from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError
 from protocol.text.names import nearest

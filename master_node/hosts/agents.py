@@ -14,7 +14,8 @@ from typing import Self
 from master_node.hosts.agent_models import ModelPlacing, Uploading, WantedModel, wanted_model
 from master_node.hosts.agent_requests import SeenAgent, ask_agent
 from master_node.slaves.remote import orphan_time
-from master_node.system.system import SlaveSettings, System
+from master_node.system.system import System
+from master_node.system.tables import SlaveSettings
 from protocol.bus.bus import Bus, PendingReply
 from protocol.description import SlaveDescription
 from protocol.errors import (

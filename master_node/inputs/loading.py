@@ -18,7 +18,8 @@ from master_node.inputs.continuous import SignalFunction
 from master_node.inputs.discrete import HoldRows
 from master_node.inputs.text_tables import SUFFIXES, TextTable, is_number, read_text_table
 from master_node.numerics.input_tables import InputTableError, Table, make_table
-from master_node.system.system import InputRows, InputSettings, System
+from master_node.system.system import System
+from master_node.system.tables import InputRows, InputSettings
 from protocol.errors import ConfigurationError
 from protocol.host.user_code import load_module, user_context
 from protocol.signals import FloatArray

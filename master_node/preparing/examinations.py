@@ -25,7 +25,8 @@ import numpy as np
 from master_node.coupling.coupled_system import CoupledSystem, SlavePart
 from master_node.coupling.step_sizes import check_step_sizes
 from master_node.slaves.group import Program, SlaveGroup
-from master_node.system.system import SlaveSettings, System
+from master_node.system.system import System
+from master_node.system.tables import SlaveSettings
 from protocol.calls import Configure, Examine, GetState, Reply, SetInputs, SetState
 from protocol.description import (
     SUBSTEP_ERROR,

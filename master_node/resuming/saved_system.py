@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from master_node.system.files import open_system
-from master_node.system.system import InputSettings, System
+from master_node.system.system import System
+from master_node.system.tables import InputSettings
 from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError, ResultsError
 from protocol.host.files import file_sha256

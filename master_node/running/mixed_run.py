@@ -28,7 +28,7 @@ from master_node.stepping.follower_slaves import LateSlaves
 from master_node.stepping.requests import BrokenOffError
 
 if TYPE_CHECKING:
-    from master_node.system.system import SimulationSettings
+    from master_node.system.simulation import SimulationSettings
 
 _INF = float("inf")
 

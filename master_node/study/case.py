@@ -7,7 +7,8 @@ from pathlib import Path
 
 import tomli_w
 
-from master_node.system.system import Scalar, System
+from master_node.system.fields import Scalar
+from master_node.system.system import System
 from master_node.system.toml_files import read_tables
 from protocol.errors import ConfigurationError
 

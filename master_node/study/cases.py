@@ -20,7 +20,7 @@ from master_node.study.configuration import (
     Sample,
     Study,
 )
-from master_node.system.system import Scalar
+from master_node.system.fields import Scalar
 from protocol.errors import ConfigurationError
 from protocol.host.toml_text import toml_value
 

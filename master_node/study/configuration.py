@@ -25,7 +25,8 @@ from pydantic import (
 )
 
 from master_node.numerics.reductions import REDUCTIONS
-from master_node.system.system import Number, Positive, Reference, Scalar, configuration_error
+from master_node.system.fields import Number, Positive, Reference, Scalar
+from master_node.system.mistakes import configuration_error
 from master_node.system.toml_files import read_located_tables
 from protocol.errors import ConfigurationError
 from protocol.text.names import nearest

@@ -15,12 +15,13 @@ from master_node.numerics.reductions import REDUCTIONS_OF_VALUES
 from master_node.results.patterns import chosen
 from master_node.results.selection import check_variables
 from master_node.results.summary import settings_sha256
-from master_node.simulation import settings_of
 from master_node.study.case import Case, apply_case
 from master_node.study.cases import cases_of
 from master_node.study.configuration import Study
 from master_node.system.files import open_system
-from master_node.system.system import InputSettings, System
+from master_node.system.summary import settings_of
+from master_node.system.system import System
+from master_node.system.tables import InputSettings
 from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError, DoublestepError
 from protocol.host.files import file_sha256

@@ -16,7 +16,7 @@ from master_node.study.configuration import ReducedOutput
 from master_node.study.directory import run_name
 from master_node.study.plan import Plan, PlannedRun
 from master_node.study.records import RunRecord
-from master_node.system.system import Scalar
+from master_node.system.fields import Scalar
 from protocol.errors import ConfigurationError, ResultsError
 
 Cell = Scalar | None

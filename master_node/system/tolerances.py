@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from master_node.system.system import SlaveSettings, System
+from master_node.system.system import System
+from master_node.system.tables import SlaveSettings
 from protocol.variables import Variable
 
 

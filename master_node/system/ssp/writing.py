@@ -20,7 +20,8 @@ from master_node.system.ssp.reading import (
 )
 from master_node.system.ssp.xml_nodes import NAMESPACES
 from master_node.system.start_values import GivenValue, structural_parameters
-from master_node.system.system import Connection, SlaveSettings, System
+from master_node.system.system import System
+from master_node.system.tables import Connection, SlaveSettings
 from protocol.description import SlaveDescription
 from protocol.errors import ConfigurationError
 from protocol.host.files import as_file
