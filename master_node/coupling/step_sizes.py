@@ -10,6 +10,7 @@ from math import ulp
 from master_node.coupling.coupled_system import CoupledSystem
 from master_node.inputs.continuous import Jump
 from master_node.numerics.double_step_times import DoubleStepTimes
+from master_node.numerics.error_estimators import ESTIMATORS
 from master_node.numerics.step_size_limits import (
     SlaveLimits,
     StepSizeLimits,
@@ -45,9 +46,9 @@ def step_size_limits(system: System) -> StepSizeLimits:
         ConfigurationError: nothing.
     """
     settings = system.simulation
-    limits = _limits(
-        system, settings.smallest, settings.largest, long_step=settings.estimator == "rich"
-    )
+    estimator = ESTIMATORS.get(settings.estimator)
+    long_step = estimator is not None and estimator.needs_long_step
+    limits = _limits(system, settings.smallest, settings.largest, long_step=long_step)
     reached = start = float(settings.start_time)
     ways = []
     for event in sorted(settings.events):

@@ -28,7 +28,7 @@ from protocol.signals import MAX_ORDER, FloatArray
 
 
 class Comparison(StrEnum):
-    """Which comparison solution an estimator needs."""
+    """Comparison solution that an estimator needs."""
 
     LONG_STEP = "long step"
     """One step of 2H with inputs through every second communication point."""
@@ -51,13 +51,18 @@ class ErrorEstimator:
     comparison: Comparison
     paper_ratios: tuple[float, ...]
 
+    @property
+    def needs_long_step(self) -> bool:
+        """True if a step of 2H is taken, so that slaves must be able to take one."""
+        return self.comparison is Comparison.LONG_STEP
+
     def points(self, points: int) -> int:
         """Depth of history for input polynomials through ``points`` points."""
-        return 2 * points - 1 if self.comparison is Comparison.LONG_STEP else points
+        return 2 * points - 1 if self.needs_long_step else points
 
     def available(self, points: int) -> int:
-        """Through how many of ``points`` communication points all its polynomials can go."""
-        return (points + 1) // 2 if self.comparison is Comparison.LONG_STEP else points
+        """Number of communication points, of ``points``, through which all its polynomials can go."""
+        return (points + 1) // 2 if self.needs_long_step else points
 
     @staticmethod
     def estimate(difference: FloatArray, ratio: FloatArray | float) -> FloatArray:

@@ -119,7 +119,7 @@ class StepSizeController:
         return min(self.largest_step_size, max(self.smallest_step_size, step_size))
 
 
-EXPONENTS = {"elementary": (1.0, 0.0), "pi": (0.7, -0.4)}
+EXPONENTS = {"pi": (0.7, -0.4), "elementary": (1.0, 0.0)}
 """(b_1, b_2) of the controllers by their names."""
 
 

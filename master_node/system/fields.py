@@ -70,11 +70,16 @@ def _sha256(value: str) -> str:
     return value
 
 
-def _format(value: str) -> str:
-    if value not in FORMATS:
-        *names, last = map(repr, FORMATS)
-        raise ValueError(f"write {', '.join(names)} or {last}")
-    return value
+def one_of(*names: str) -> AfterValidator:
+    """Check of a text that is one of ``names``."""
+
+    def check(value: str) -> str:
+        if value not in names:
+            *others, last = map(repr, names)
+            raise ValueError(f"write {', '.join(others)} or {last}")
+        return value
+
+    return AfterValidator(check)
 
 
 def _not_empty(value: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -117,7 +122,7 @@ Wait = Annotated[Number, Field(gt=0, le=1e6)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Reference = Annotated[StrictStr, AfterValidator(_reference)]
 Pattern = Annotated[StrictStr, AfterValidator(_pattern)]
-Format = Annotated[StrictStr, AfterValidator(_format)]
+Format = Annotated[StrictStr, one_of(*FORMATS)]
 Scalar = StrictBool | StrictInt | StrictFloat | StrictStr
 FiniteScalar = Annotated[Scalar, AfterValidator(_finite_scalar)]
 AgentName = Annotated[StrictStr, AfterValidator(_agent_name)]

@@ -9,17 +9,21 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import (
     Field,
     StrictBool,
+    StrictStr,
     field_validator,
     model_validator,
 )
 
 from master_node.numerics.dense_output import OutputGrid
+from master_node.numerics.error_estimators import EST_MOD, ESTIMATORS
 from master_node.numerics.extrapolation import InputPolynomial
+from master_node.numerics.step_size_controller import EXPONENTS
 from master_node.system.fields import (
     FrozenTable,
     NotNegative,
     Number,
     Positive,
+    one_of,
 )
 from protocol.errors import ConfigurationError
 from protocol.signals import MAX_ORDER
@@ -92,9 +96,9 @@ class SimulationSettings(FrozenTable):
     initial_step_size: Positive | None = None
     order: Literal[0, 1, 2, 3, "auto"] = "auto"
     derivative_points: Literal[0, 1, 2] | None = None
-    estimator: Literal["rich", "mod", "none"] = "mod"
+    estimator: Annotated[StrictStr, one_of(*ESTIMATORS, "none")] = EST_MOD.name
     constants: Literal["exact", "paper"] = "exact"
-    controller: Literal["pi", "elementary"] = "pi"
+    controller: Annotated[StrictStr, one_of(*EXPONENTS)] = "pi"
     sequence: Literal["jacobi", "gauss-seidel"] = "jacobi"
     coupling: Literal["auto", "explicit", "implicit"] = "auto"
     evaluate_outputs: StrictBool = False
