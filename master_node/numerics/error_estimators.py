@@ -61,7 +61,7 @@ class ErrorEstimator:
         return 2 * points - 1 if self.needs_long_step else points
 
     def available(self, points: int) -> int:
-        """Number of communication points, of ``points``, through which all its polynomials can go."""
+        """Number of communication points, of ``points``, through which all its polynomials go."""
         return (points + 1) // 2 if self.needs_long_step else points
 
     @staticmethod
