@@ -27,7 +27,7 @@ from master_node.system.system import System
 from protocol.bus.bus import DEFAULT_ENDPOINT, Bus
 from protocol.bus.credentials import Credentials, Role
 from protocol.bus.endpoints import Endpoints, Mode, free_endpoint
-from protocol.bus.zenoh import ZenohBus
+from protocol.bus.opening import open_bus
 from protocol.calls import Describe
 from protocol.description import SlaveDescription
 from protocol.errors import (
@@ -141,7 +141,7 @@ def slaves_on_bus(
         endpoints = _endpoints(
             system, private, launched=bool(launched), found=bool(found or elsewhere)
         )
-        bus = ZenohBus(endpoints, timeout=system.bus.discovery_timeout)
+        bus = open_bus(endpoints, timeout=system.bus.discovery_timeout)
         stack.callback(bus.close)
         run = token_hex(4)
         add_log_fields(run=run)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from protocol.bus.bus import DEFAULT_ENDPOINT, Bus
 from protocol.bus.credentials import Credentials
 from protocol.bus.endpoints import Endpoints, Mode
+from protocol.bus.opening import open_bus
 from protocol.bus.reachability import Reach, probe
-from protocol.bus.zenoh import ZenohBus
 from protocol.errors import DoublestepError
 from protocol.wire.administration import STATUS_BYTES
 
@@ -69,7 +69,7 @@ def windows(
         made = []
         if listen:
             endpoints = Endpoints(tuple(listen), (), insecure, Mode.PEER, credentials)
-            bus = ZenohBus(endpoints, largest=STATUS_BYTES)
+            bus = open_bus(endpoints, largest=STATUS_BYTES)
             stack.callback(bus.close)
             made.append(Window(", ".join(listen), True, bus))
         with ThreadPoolExecutor(_AT_ONCE) as pool:
@@ -85,7 +85,7 @@ def windows(
 def _open(endpoints: Endpoints) -> Window:
     (where,) = endpoints.connect
     try:
-        bus = ZenohBus(endpoints, timeout=_CONNECT_TIME, largest=STATUS_BYTES)
+        bus = open_bus(endpoints, timeout=_CONNECT_TIME, largest=STATUS_BYTES)
     except DoublestepError as error:
         return Window(where, False, None, error)
     return Window(where, False, bus)

@@ -80,7 +80,7 @@ def agent(  # noqa: PLR0917  options of the command line
     log_format: LogStyle = LogFormat.TEXT,
 ) -> None:
     """Start slaves on this host when masters ask for them, until SIGTERM or Ctrl-C."""
-    from protocol.bus.zenoh import ZenohBus
+    from protocol.bus.opening import open_bus
     from protocol.wire.agents import AGENT_MESSAGE_BYTES
     from protocol.wire.packing import MAX_MESSAGE_BYTES
     from slave_node.agent.agent import Agent, Offer, Surroundings
@@ -119,7 +119,7 @@ def agent(  # noqa: PLR0917  options of the command line
         try:
             is_passing_on = bool(places.own.listen)  # what masters and slaves say to each other
             largest = MAX_MESSAGE_BYTES if is_passing_on else AGENT_MESSAGE_BYTES
-            bus = ZenohBus(places.own, stop=ending, largest=largest)
+            bus = open_bus(places.own, stop=ending, largest=largest)
             stack.callback(bus.close)
             log.info("on the bus %s", shown_places(places.own))
             surroundings = Surroundings(places.of_slaves, scratch, logs)

@@ -33,7 +33,7 @@ def router(
     log_format: LogStyle = LogFormat.TEXT,
 ) -> None:
     """Connect masters and slaves in mode client with each other, until SIGTERM or Ctrl-C."""
-    from protocol.bus.zenoh import ZenohBus
+    from protocol.bus.opening import open_bus
     from slave_node.serving.router import serve_router
 
     configure_logs(log_format, "%(asctime)s router: %(message)s")
@@ -51,7 +51,7 @@ def router(
         ending.set()
 
     end_on_signals(end)
-    bus = ZenohBus(endpoints)
+    bus = open_bus(endpoints)
     try:
         log.info("on the bus %s", shown_places(endpoints))
         serve_router(bus, RouterKey(token_hex(4)), shown_places(endpoints), ending)
@@ -73,7 +73,7 @@ def check(  # noqa: PLR0917  options of the command line
     ] = 3.0,
 ) -> None:
     """Exit code 0 if NAME serves, 3 if not: for health checks of service managers."""
-    from protocol.bus.zenoh import ZenohBus
+    from protocol.bus.opening import open_bus
     from slave_node.serving.health import check_alive
 
     role = Role.SLAVE if name else Role.ROUTER
@@ -86,7 +86,7 @@ def check(  # noqa: PLR0917  options of the command line
     if name:
         check_name(name)
     with interruptible():
-        bus = ZenohBus(endpoints, timeout=timeout, largest=STATUS_BYTES)
+        bus = open_bus(endpoints, timeout=timeout, largest=STATUS_BYTES)
         try:
             check_alive(bus, name, agent=agent)
         finally:

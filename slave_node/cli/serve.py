@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protocol.bus.bus import DEFAULT_ENDPOINT
+from protocol.bus.bus import DEFAULT_ENDPOINT, Bus
 from protocol.bus.credentials import Credentials, Role
 from protocol.bus.endpoints import LOOPBACK, Endpoints, Mode
 from protocol.errors import DoublestepError
@@ -88,7 +88,7 @@ def serve(  # noqa: PLR0917  options of the command line
     processor: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
     """Load MODEL and serve it until SIGTERM or Ctrl-C."""
-    from protocol.bus.zenoh import ZenohBus
+    from protocol.bus.opening import open_bus
     from slave_node.serving.given_parameters import check_parameters
     from slave_node.serving.node import SlaveNode
     from slave_node.worker.process import ModelReference, WorkerProcess
@@ -117,7 +117,7 @@ def serve(  # noqa: PLR0917  options of the command line
     worker: Worker = WorkerProcess(reference, load_timeout)
     if metrics_port is not None:
         worker = _counting(worker, key.name, stack, metrics_port, metrics_host)
-    bus: ZenohBus | None = None
+    bus: Bus | None = None
     node: SlaveNode | None = None
     ending = threading.Event()
 
@@ -141,7 +141,7 @@ def serve(  # noqa: PLR0917  options of the command line
         check_parameters(description, reference.parameters, ignores_bounds=ignore_bounds)
         for remark in description.remarks:
             log.warning("%s", remark)
-        bus = ZenohBus(endpoints, stop=ending)
+        bus = open_bus(endpoints, stop=ending)
         node = SlaveNode(bus, worker, key, description, load_timeout=load_timeout)
         if not ending.is_set():
             log.info("%s loaded; on the bus %s", model, shown_places(endpoints))
