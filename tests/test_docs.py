@@ -33,6 +33,7 @@ from master_node import simulate
 from master_node.numerics.error_estimators import EST_MOD, EST_RICH
 from master_node.numerics.reductions import REDUCTIONS
 from master_node.observing.metrics import RunMetrics
+from master_node.results.formats import FORMATS
 from master_node.slaves import remote as remote_slave
 from master_node.study.configuration import (
     Cases,
@@ -206,6 +207,12 @@ def test_the_table_names_every_option_of_a_run_and_no_other() -> None:
     known = set(re.findall(r"--[a-z-]+", help_of("master-node", "run"))) - {"--help"}
     rows = [row[0] for row in tables(text)[0][1:]]
     assert set(re.findall(r"--[a-z-]+", " ".join(rows))) == known
+
+
+def test_the_help_names_every_result_format() -> None:
+    """In the help of ``--output-format``, which is written before the formats are imported."""
+    told = help_of("master-node", "run").partition("--output-format")[2].partition("--")[0]
+    assert set(re.findall(r"\w+", told)) >= set(FORMATS)
 
 
 @pytest.mark.parametrize(

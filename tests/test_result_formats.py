@@ -41,6 +41,7 @@ from master_node.results import (
     ResultsWriter,
     SelectedResults,
     check_variables,
+    formats,
     parquet_file,
 )
 from master_node.results import writer as writer_module
@@ -63,7 +64,7 @@ START = RunStart(
     discrete_units=("1/min", "", "", "", ""),
     discrete=(1.5, 1, False, "a", b"\0"),
 )
-FORMATS = ("csv", "arrow", "parquet", "mat")
+FORMATS = tuple(formats.FORMATS)
 FILES = {name: f"results.{name}" for name in FORMATS}
 
 
