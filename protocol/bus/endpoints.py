@@ -98,11 +98,6 @@ def host_and_port(endpoint: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def host_of(endpoint: str) -> str:
-    """The host of an endpoint; raises as `host_and_port`."""
-    return host_and_port(endpoint)[0]
-
-
 def free_endpoint() -> str:
     """A loopback endpoint with a port that is free now."""
     with socket.socket() as probe:

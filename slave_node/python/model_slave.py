@@ -509,10 +509,6 @@ def _read_only(array: FloatArray) -> FloatArray:
     return array
 
 
-def _text(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
-
-
 def _converted(variable: Variable, value: StartValue) -> StartValue:
     """``value`` in the type of the variable.
 
