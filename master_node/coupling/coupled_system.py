@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from master_node.coupling.external import (
     max_order,
     resolve_external,
 )
+from master_node.coupling.feed_through import FeedThroughOrder, Key, feed_through_order
 from master_node.coupling.recorded_variables import RecordedVariables, wanted_variables
 from master_node.inputs.continuous import ExternalInputs, Jump
 from master_node.inputs.loading import load_signals
@@ -39,9 +39,6 @@ from protocol.errors import ConfigurationError
 from protocol.signals import FloatArray
 from protocol.text.names import nearest
 from protocol.variables import Causality, StartValue, Variable
-
-_Key = tuple[str, str]
-"""Slave and variable by their names."""
 
 
 @dataclass(frozen=True)
@@ -117,27 +114,6 @@ class SlavePart:
         both[: len(own), :number] = own
         both[: len(outside), number:] = outside
         return both
-
-
-@dataclass(frozen=True)
-class FeedThroughOrder:
-    """In which order outputs follow from inputs that follow from outputs.
-
-    Attributes:
-        levels: the outputs of level l depend on connected inputs fed by outputs of lower levels
-            only; shape (m,); empty if there is an algebraic loop.
-        discrete_levels: the same for the discrete outputs.
-        loop: ``slave.variable`` along an algebraic loop, else empty.
-    """
-
-    levels: NDArray[np.intp]
-    discrete_levels: NDArray[np.intp]
-    loop: tuple[str, ...]
-
-    @property
-    def highest(self) -> int:
-        """The highest level; 0 without outputs."""
-        return int(max(self.levels.max(initial=0), self.discrete_levels.max(initial=0)))
 
 
 @dataclass(frozen=True)
@@ -308,8 +284,8 @@ def resolve(
         absolute_tolerance=np.array([absolute for absolute, _ in tolerances]),
         relative_tolerance=np.array([relative for _, relative in tolerances]),
         is_controlled=is_controlled,
-        initialization=_feed_through_order(output_index, discrete, initial, feeding),
-        at_point=_feed_through_order(output_index, discrete, direct, feeding),
+        initialization=feed_through_order(output_index, discrete, initial, feeding),
+        at_point=feed_through_order(output_index, discrete, direct, feeding),
         discrete=discrete,
         recorded=recorded,
         external=ExternalInputs([one for each in external.values() for one in each.continuous]),
@@ -330,7 +306,7 @@ def resolve(
 
 def _depends(
     parts: Sequence[SlavePart],
-    direct: Mapping[_Key, tuple[str, ...]],
+    direct: Mapping[Key, tuple[str, ...]],
     inputs: Mapping[str, Sequence[str]],
 ) -> NDArray[np.bool_]:
     """True if each output depends directly on one of these inputs of its slave, shape (m,)."""
@@ -421,31 +397,3 @@ def _check_slave_tables(
                     raise ConfigurationError(
                         f"{place(slave, name)}: no such variable{nearest(name, known)}"
                     )
-
-
-def _feed_through_order(
-    output_index: Mapping[_Key, int],
-    discrete: DiscreteCoupling,
-    feed_through: Mapping[_Key, tuple[str, ...]],
-    feeding: Mapping[str, Mapping[str, ScalarConnection]],
-) -> FeedThroughOrder:
-    depends = {
-        (slave, output): [
-            feeding[slave][name].source.key
-            for name in feed_through[slave, output]
-            if name in feeding[slave]
-        ]
-        for slave, output in (*output_index, *discrete.keys)
-    }
-    level: dict[_Key, int] = {}
-    try:
-        for output in TopologicalSorter(depends).static_order():
-            level[output] = max((level[source] + 1 for source in depends[output]), default=0)
-    except CycleError as error:
-        loop = tuple(f"{slave}.{variable}" for slave, variable in error.args[1])
-        return FeedThroughOrder(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp), loop)
-    return FeedThroughOrder(
-        np.array([level[key] for key in output_index], dtype=np.intp),
-        np.array([level[key] for key in discrete.keys], dtype=np.intp),
-        (),
-    )
