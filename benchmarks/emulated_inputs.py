@@ -33,7 +33,7 @@ class _Run(NamedTuple):
     steps: int
     error: float
     time: float
-    """Of the slaves, for one do_step [s]."""
+    """Time of the slaves for one do_step [s]."""
 
 
 def _measured(system: System) -> _Run:

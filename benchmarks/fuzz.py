@@ -72,7 +72,7 @@ def main(words: list[str]) -> None:
 
 
 def _memory() -> float:
-    """Of this process, once the C library has given back what is free [MB]."""
+    """Memory of this process, once the C library has given back what is free [MB]."""
     gc.collect()
     library = ctypes.CDLL(None)
     if hasattr(library, "malloc_trim"):
@@ -81,7 +81,7 @@ def _memory() -> float:
 
 
 def _peak_memory() -> float:
-    """Of this process [MB]."""
+    """Memory of this process [MB]."""
     import resource  # noqa: PLC0415  POSIX only, and this is the only benchmark that needs it
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

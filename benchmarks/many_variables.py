@@ -1,4 +1,4 @@
-"""What 5 000 connected variables cost: a double step of two slaves, against one with ten."""
+"""Cost of 5 000 connected variables: a double step of two slaves, against one with ten."""
 
 import importlib.util
 import sys

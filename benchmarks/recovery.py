@@ -1,4 +1,4 @@
-"""How soon a killed slave process is noticed, and how soon the run goes on."""
+"""Time until a killed slave process is noticed, and until the run goes on."""
 
 import logging
 import statistics

@@ -1,4 +1,4 @@
-"""What it costs to save states by forking: a whole double step, and a single save and restore."""
+"""Cost of saving states by forking: a whole double step, and a single save and restore."""
 
 import tempfile
 from collections import defaultdict

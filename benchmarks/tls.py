@@ -53,7 +53,7 @@ class InTurn:
 
     @property
     def median(self) -> float:
-        """Of the attempts after the warm-up [us]."""
+        """Median time of the attempts after the warm-up [us]."""
         return float(np.median(self._times[_WARM_UP:])) * 1e6
 
 

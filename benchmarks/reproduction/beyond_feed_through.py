@@ -96,7 +96,7 @@ def _system(**simulation: object) -> System:
 
 
 class EvaluatedStarts(ExactStarts):
-    """The same with outputs evaluated again at the communication points."""
+    """Run with outputs evaluated again at the communication points."""
 
     def _started_at(self, time: float, polynomial: InputPolynomial, estimator: str) -> System:
         system = super()._started_at(time, polynomial, estimator)

@@ -48,7 +48,7 @@ def paragraphs(*parts: str) -> str:
 
 
 def verdict(*, reached: bool) -> str:
-    """What became of a requirement."""
+    """Result of a requirement."""
     return "reached" if reached else "**not reached**"
 
 

@@ -23,7 +23,7 @@ DIVERGED = 1.0
 FEWEST = {name: 400 if name == "two_mass" else 200 for name in SMOOTH}
 """Constant steps; fewer are unstable for two_mass."""
 STEPS = {name: [first * 2**i for i in range(5)] for name, first in FEWEST.items()}
-"""How many constant steps a run takes."""
+"""Number of constant steps of a run."""
 
 
 class Curve(NamedTuple):

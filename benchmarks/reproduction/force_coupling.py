@@ -32,7 +32,7 @@ class Case(NamedTuple):
 
     @property
     def is_long(self) -> bool:
-        """Whether it takes so many steps that it is run in process, and by the FMUs only."""
+        """True if it takes so many steps that it is run in process, and by the FMUs only."""
         return self.order == 0 and self.absolute == TO_THE_LETTER
 
 

@@ -1,4 +1,4 @@
-"""What the estimates say of the true local error: along the motion, over H, after H has changed."""
+"""Estimates and the true local error: along the motion, over H, after H has changed."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ SMOOTH = (QUARTER_CAR, "two_mass", "van_der_pol", "chain")
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a run gave and how far off it was.
+    """Result of a run, and its error.
 
     Attributes:
         result: of the run.
@@ -68,7 +68,7 @@ class Run:
 
     @property
     def do_steps(self) -> int:
-        """Of each slave; of the busiest where they differ."""
+        """Number of do_steps of each slave; of the busiest where they differ."""
         return int(max(self.result.summary["do_steps"].values()))
 
     @property

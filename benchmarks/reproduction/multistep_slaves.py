@@ -26,7 +26,7 @@ class Wheel(quarter_car.Wheel):
 
 
 class Summary(NamedTuple):
-    """What Table 1 tells of a run, but for the time."""
+    """Figures of a run in Table 1, but for the time."""
 
     error: float
     steps: int

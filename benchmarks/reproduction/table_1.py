@@ -80,7 +80,7 @@ class Measured:
 
     @property
     def do_steps(self) -> int:
-        """Of each slave."""
+        """Number of do_steps of each slave."""
         return max(map(int, self.result.summary["do_steps"].values()))
 
     @property
@@ -135,7 +135,7 @@ class Spread(NamedTuple):
 
 
 def spread(row: PaperRow) -> Spread:
-    """What the choice of alpha, theta_min and theta_max does to a row."""
+    """Effect of alpha, theta_min and theta_max on a row."""
     runs = [measure_row(row, FMUS, in_process=True, **corner) for corner in CORNERS]
     steps = [run.steps for run in runs]
     rejections = [run.rejections for run in runs]

@@ -1,4 +1,4 @@
-"""What each FMU of the collection is made of: sources, capabilities, model description."""
+"""Parts of each FMU of the collection: sources, capabilities, model description."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _FRONTS = {
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What an FMU can do, in terms common to the versions of FMI."""
+    """Capabilities of an FMU, in terms common to the versions of FMI."""
 
     saved_states: bool = True
     variable_steps: bool = True
@@ -232,7 +232,7 @@ def quarter_car() -> Iterator[Fmu]:
 LAG = (SOURCES / "lag.h", SOURCES / "lag.c")
 LAG_CAPABILITIES = Capabilities(input_derivatives=1, output_derivatives=1)
 LAG_REFERENCES = 10
-"""How many value references each lag takes (src/lag.h)."""
+"""Number of value references that each lag takes (src/lag.h)."""
 EXPERIMENT = {"startTime": "0", "stopTime": "2", "tolerance": "1e-6", "stepSize": "0.01"}
 
 

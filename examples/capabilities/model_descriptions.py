@@ -45,7 +45,7 @@ class Variable:
     unit: str | None = None
     description: str | None = None
     derivative: str | None = None
-    """Of which variable it is the derivative."""
+    """Variable of which it is the derivative."""
     depends: tuple[str, ...] | None = None
     """Inputs, states and parameters that an output or derivative depends on; None says nothing."""
     declared_type: str | None = None
@@ -65,7 +65,7 @@ class Variable:
 
     @property
     def is_initially_unknown(self) -> bool:
-        """Whether ``initial`` is calculated, given or by default."""
+        """True if ``initial`` is calculated, given or by default."""
         if self.initial is not None:
             return self.initial != "exact"
         return self.causality in ("output", "local", "calculatedParameter")
@@ -81,7 +81,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Description:
-    """What an FMU has and can do."""
+    """Variables and capabilities of an FMU."""
 
     name: str
     description: str

@@ -53,10 +53,10 @@ class BuildError(Exception):
 
 @dataclass(frozen=True)
 class Fmu:
-    """What an FMU is made of."""
+    """Parts of an FMU."""
 
     name: str
-    """Of the file, and the modelIdentifier."""
+    """Name of the file, and the modelIdentifier."""
     description: bytes
     """The text of modelDescription.xml."""
     sources: tuple[Path, ...]
@@ -76,7 +76,7 @@ class Fmu:
 
 
 class Build(Protocol):
-    """What the ``build.py`` of an example offers, at the command line and to the tests."""
+    """Interface of the ``build.py`` of an example, for the command line and the tests."""
 
     def __call__(self, output: Path, *, force: bool = False) -> list[Path]:
         """Build the example's FMUs into the folder ``output``, see `build`."""

@@ -34,12 +34,12 @@ FloatArray = NDArray[np.float64]
 FOLDER = Path(__file__).resolve().parent
 
 _LONGEST_STEP = 0.02
-"""Of the van der Pol oscillators' integration [s]: so the dense output is as good as the steps."""
+"""Largest internal step of van der Pol oscillators [s], for a dense output as good as the steps."""
 
 
 @dataclass(frozen=True, eq=False)
 class Oscillators:
-    """What a system file says, with the FMUs' start values where it says nothing.
+    """Parameters in a system file, with the FMUs' start values where it says nothing.
 
     Attributes:
         start_time, stop_time: [s].
@@ -55,7 +55,7 @@ class Oscillators:
     sources: Mapping[str, str]
 
     def with_values(self, values: Mapping[str, float]) -> Oscillators:
-        """The same system with other start values and parameters."""
+        """System with other start values and parameters."""
         if unknown := values.keys() - self.values.keys():
             raise KeyError(f"no variable with a start value: {', '.join(sorted(unknown))}")
         return replace(self, values={**self.values, **values})
@@ -230,7 +230,7 @@ def reference_solution(
     times: ArrayLike,
     values: Mapping[str, float] | None = None,
 ) -> FloatArray:
-    """What a co-simulation of a system should give.
+    """Reference for a co-simulation of a system.
 
     Args:
         name: one of `SYSTEMS`.

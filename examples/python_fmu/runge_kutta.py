@@ -1,4 +1,4 @@
-"""What both models have in common: the classical Runge-Kutta method of order 4."""
+"""Integrator of both models: the classical Runge-Kutta method of order 4."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from math import ceil
 
 LONGEST_STEP = 1e-3
-"""Of an internal step [s]."""
+"""Size of an internal step [s]."""
 
 
 def integrate(
