@@ -10,11 +10,14 @@ from master_node.coupling.coupled_system import CoupledSystem
 from master_node.coupling.scheme import CouplingScheme
 from master_node.judging.available_polynomials import AvailablePolynomials
 from master_node.judging.comparison import ErrorControl, StepError
+from master_node.judging.defects import CouplingDefects
 from master_node.judging.unanswered_inputs import Bound
 from master_node.numerics.error_estimators import node_polynomial, small_steps_integral
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial, Nodes, Polynomials
 from master_node.numerics.order_control import (
+    LARGEST_FACTOR,
     NO_BOUNDS,
+    SMALLEST_FACTOR,
     Candidate,
     Choice,
     OrderMemory,
@@ -25,6 +28,8 @@ from master_node.numerics.order_control import (
 )
 from master_node.stepping.double_step import DoubleStep
 from protocol.signals import FloatArray
+
+_INF = float("inf")
 
 
 class OrderSelection:
@@ -37,6 +42,7 @@ class OrderSelection:
         available: the polynomials that a history allows.
         largest: the highest polynomial that may be chosen.
         alpha: safety factor of the step size controller.
+        coupling: defects that bound H, too; None: all slaves can go back.
     """
 
     def __init__(
@@ -48,12 +54,14 @@ class OrderSelection:
         available: AvailablePolynomials,
         largest: InputPolynomial,
         alpha: float,
+        coupling: CouplingDefects | None = None,
     ) -> None:
         self._coupled = coupled
         self._scheme = scheme
         self._control = control
         self._available = available
         self._alpha = alpha
+        self._coupling = coupling
         kinds = scheme.extrapolation.kinds
         self._ladder = ladder(
             has_derivatives=any(kind.has_derivative for kind in kinds),
@@ -137,16 +145,36 @@ class OrderSelection:
         self,
         candidates: Sequence[Candidate],
         history: CouplingHistory,
-        step: DoubleStep,  # noqa: ARG002  for systems with more to consider
+        step: DoubleStep,
         bound: Bound | None,
     ) -> Mapping[InputPolynomial, float]:
-        """What bounds H over the present H, apart from the estimated error."""
-        if bound is None:
+        """Bounds of H over the present H, apart from the estimated error."""
+        if bound is None and self._coupling is None:
             return NO_BOUNDS
         return {
-            candidate.polynomial: bound(self._available.of(candidate.polynomial, history))
+            candidate.polynomial: self._bound(candidate.polynomial, history, step, bound)
             for candidate in candidates
         }
+
+    def _bound(
+        self,
+        polynomial: InputPolynomial,
+        history: CouplingHistory,
+        step: DoubleStep,
+        bound: Bound | None,
+    ) -> float:
+        polynomials, taken = self._available.of(polynomial, history), step.times.first
+        largest = _INF if bound is None else bound(polynomials)
+        if self._coupling is None:
+            return largest
+        by_defects = self._coupling.step_size(
+            history,
+            polynomials,
+            step.end[0],
+            smallest=SMALLEST_FACTOR * taken,
+            largest=LARGEST_FACTOR * taken,
+        )
+        return min(by_defects / taken, largest)
 
     def _next(
         self, polynomial: InputPolynomial, history: CouplingHistory, step_size: float

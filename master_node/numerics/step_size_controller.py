@@ -9,6 +9,11 @@ from typing import NamedTuple
 from master_node.numerics.powers import power
 
 
+def passes(error_norm: float) -> bool:
+    """True if a step with this ERR is within the tolerance; never for NaN or infinity."""
+    return error_norm <= 1.0
+
+
 class ControllerMemory(NamedTuple):
     """Memory of a controller from one attempt to the next.
 
@@ -84,7 +89,7 @@ class StepSizeController:
             memory: from the last decision.
         """
         before = memory.error_norm
-        if not error_norm <= 1.0:
+        if not passes(error_norm):
             factor = self.elementary_factor(error_norm, exponent)
             following = ControllerMemory(before, rejected=True)
             return StepDecision(False, self.bounded(step_size * factor), following)

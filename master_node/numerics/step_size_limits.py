@@ -217,6 +217,10 @@ class StepSizeLimits:
         is_last = target == self.stop_time and self.has_reached(end, target)
         return target if is_last else end
 
+    def bounded(self, step_size: float) -> float:
+        """``step_size`` within the smallest and the largest one [s]."""
+        return min(self.largest, max(self.smallest, step_size))
+
     def has_reached(self, time: float, target: float) -> bool:
         """True if ``time`` is ``target`` [s], or nearer to it than any step leads."""
         return target - time < _NO_STEP * self.smallest

@@ -37,7 +37,7 @@ from protocol.wire.keys import is_name
 _SYSTEM_FILE = "system.json"
 _RUN_FILE = "run.zip"
 _RUN = "run.json"
-_VERSION = 2
+_VERSION = 3
 _LENGTH = Struct("<I")
 _LARGEST = 2**30
 

@@ -1,8 +1,7 @@
 """One run of a coupled system: initialize, step to the stop time, terminate.
 
-Nothing here knows where a slave is. The steps themselves are in ``controlled_run.py``, with slaves
-of which some have no rollback in ``mixed_run.py``, of which none has in ``defect_run.py``, and,
-without an estimator, in ``fixed_run.py``.
+Nothing here knows where a slave is. The steps are taken by the loop (`loop.py`), with the method
+that the system needs (`methods/choosing.py`).
 """
 
 from __future__ import annotations
@@ -16,14 +15,17 @@ import numpy as np
 
 from master_node.coupling.coupled_system import CoupledSystem, SlavePart
 from master_node.coupling.outputs import Outputs
+from master_node.coupling.result_points import ResultPoints
 from master_node.coupling.scheme import (
     CouplingScheme,
     output_control,
     outputs_follow_inputs,
     slaves_without_rollback,
 )
+from master_node.methods.base import Setup
+from master_node.methods.choosing import method_of
+from master_node.methods.position import Position
 from master_node.numerics.collocation import NODES
-from master_node.numerics.error_estimators import ESTIMATORS
 from master_node.observing.observers import (
     DiscreteType,
     Observer,
@@ -35,13 +37,9 @@ from master_node.observing.observers import (
 from master_node.observing.run_warnings import warnings_of
 from master_node.preparing.initialization import initialize
 from master_node.resuming.checkpoints import NO_CHECKPOINTS, Checkpoints, Resumed
-from master_node.running.context import RunContext
-from master_node.running.controlled_run import ControlledRun
-from master_node.running.coupling_run import CouplingRun
-from master_node.running.defect_run import DefectRun
-from master_node.running.fixed_run import FixedRun
 from master_node.running.interrupts import Interrupts
-from master_node.running.mixed_run import MixedRun
+from master_node.running.journal import Journal
+from master_node.running.loop import Loop
 from master_node.slaves.group import SlaveGroup
 from master_node.system.system import System
 from protocol.calls import Terminate
@@ -155,13 +153,6 @@ def _jumps_off_the_grid(coupled: CoupledSystem, system: System) -> list[str]:
         "has the right mean only, and a discrete input its old value; choose a step size that "
         "meets them, or an estimator"
     ]
-
-
-def coupling(coupled: CoupledSystem, system: System) -> str:
-    """``explicit``, ``implicit`` or ``auto``: as asked for, if all slaves can be iterated."""
-    wanted = system.simulation.coupling
-    orders = [part.max_order for part in coupled.parts if part.connected]
-    return wanted if min(orders, default=0) >= NODES else "explicit"
 
 
 def enumerations(coupled: CoupledSystem) -> dict[str, Mapping[str, int]]:
@@ -308,27 +299,28 @@ class CoSimulation:
         interrupts: Interrupts,
     ) -> str:
         """Step to the end; a slave's wish to end earlier is returned in words."""
-        context = RunContext(
-            self.group,
-            self.coupled,
-            scheme,
-            self.system,
-            self.observer,
-            statistics,
-            interrupts,
-            self.checkpoints,
-            self.resumed,
-        )
-        estimator = ESTIMATORS.get(self.system.simulation.estimator)
-        if estimator is None:
-            return FixedRun(context).run(outputs)
-        if len(slaves_without_rollback(self.coupled)) == len(self.coupled.parts):
-            return DefectRun(context).run(outputs)
-        if scheme.late_slaves:
-            return MixedRun(context, estimator).run(outputs)
-        if self.system.simulation.constants == "paper":
-            return ControlledRun(context, estimator).run(outputs)
-        return CouplingRun(context, estimator, coupling(self.coupled, self.system)).run(outputs)
+        loop = self._loop(scheme, outputs, statistics, interrupts)
+        while (ended := loop.advance()) is None:
+            pass
+        return ended.note
+
+    def _loop(
+        self,
+        scheme: CouplingScheme,
+        outputs: Outputs,
+        statistics: Statistics,
+        interrupts: Interrupts,
+    ) -> Loop:
+        setup = Setup(self.group, self.coupled, scheme, self.system)
+        method = method_of(setup)
+        grid, start = self.system.simulation.output_grid, setup.start
+        results = ResultPoints(grid, self.coupled, scheme.has_derivative, start, outputs)
+        if self.resumed is None:
+            position = method.begin(outputs)
+        else:
+            position, results.memory = self.resumed.place(Position)
+        journal = Journal(results, self.observer, statistics, interrupts)
+        return Loop(method, position, journal, self.checkpoints, setup.missing)
 
     def _terminate(self, time: float) -> str:
         """Terminate all slaves at the end [s]; the results are complete, whatever they say to it.

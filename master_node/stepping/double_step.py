@@ -27,6 +27,7 @@ import numpy as np
 from master_node.coupling.coupled_system import CoupledSystem
 from master_node.coupling.discrete import DiscreteValues
 from master_node.coupling.outputs import NO_OUTPUTS, Outputs
+from master_node.coupling.result_points import Reached, ReachedPoint
 from master_node.coupling.scheme import CouplingScheme
 from master_node.numerics.collocation import Collocation
 from master_node.numerics.double_step_times import DoubleStepTimes
@@ -99,6 +100,30 @@ class DoubleStep(NamedTuple):
     input_difference: FloatArray
     discrete: tuple[DiscreteValues, DiscreteValues] = ((), ())
     iteration: Iteration | None = None
+
+    @property
+    def begin(self) -> float:
+        """T_n [s]."""
+        return self.times.begin
+
+    @property
+    def step_size(self) -> float:
+        """H [s]."""
+        return self.times.step_size
+
+    @property
+    def reached(self) -> Reached:
+        """Both communication points that it leads to."""
+        d_middle, d_end = self.discrete
+        return (
+            ReachedPoint(self.times.middle, self.middle, d_middle),
+            ReachedPoint(self.times.end, self.end, d_end),
+        )
+
+    @property
+    def outputs(self) -> Outputs:
+        """Outputs at T_n + 2H."""
+        return Outputs(self.end, self.discrete[1])
 
     @property
     def iterations(self) -> int:

@@ -103,7 +103,7 @@ class LateSlaves:
             if failed.status is StepStatus.TERMINATED:
                 raise
             remedy = remedy_without_rollback(failed.slave)
-            raise unrepeatable(failed, to_middle.step, remedy) from failed.error
+            raise unrepeatable(failed, start, first, remedy) from failed.error
         y_end = self._merged(step.end, late.y)
         return step._replace(
             middle=y_middle,
