@@ -20,13 +20,13 @@ from typing_extensions import TypeAliasType
 
 from master_node import Result, System, load_system, open_system, resume, simulate
 from master_node.coupling.outputs import Outputs
+from master_node.methods.position import Position
 from master_node.numerics.discontinuities import Search, SmoothStep
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
 from master_node.numerics.order_control import OrderMemory
 from master_node.results import completion
 from master_node.results.files import cannot_write
 from master_node.resuming.json_values import from_plain, to_plain
-from master_node.running.controlled_run import Position
 from protocol.errors import ConfigurationError, InterruptedRunError, ResultsError
 from tests.interrupting import Interrupt
 from tests.quarter_car_case import EXAMPLES
