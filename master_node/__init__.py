@@ -7,7 +7,8 @@ from importlib import import_module
 TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than all else here
 if TYPE_CHECKING:
     from master_node.results import Result
-    from master_node.simulation import resume, simulate
+    from master_node.running.session import Session
+    from master_node.simulation import open_run, resume, simulate
     from master_node.system.files import open_system
     from master_node.system.simulation import SimulationSettings
     from master_node.system.system import System, load_system
@@ -25,10 +26,12 @@ __all__ = [
     "InputSettings",
     "Result",
     "ResultsSettings",
+    "Session",
     "SimulationSettings",
     "SlaveSettings",
     "System",
     "load_system",
+    "open_run",
     "open_system",
     "resume",
     "simulate",
@@ -36,9 +39,11 @@ __all__ = [
 
 _ELSEWHERE = {
     "Result": "results",
+    "Session": "running.session",
     "SimulationSettings": "system.simulation",
     "System": "system.system",
     "load_system": "system.system",
+    "open_run": "simulation",
     "open_system": "system.files",
     "resume": "simulation",
     "simulate": "simulation",

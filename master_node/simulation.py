@@ -45,6 +45,7 @@ from master_node.resuming.saved_system import (
     saved_system,
 )
 from master_node.running.co_simulation import CoSimulation, check_capabilities
+from master_node.running.session import Session
 from master_node.slaves.group import SlaveGroup
 from master_node.slaves.restorable import RestorableSlave
 from master_node.slaves.shared_process import Baseline, SharedProcess, shared_process
@@ -97,6 +98,43 @@ def simulate(
         trace=None if trace is None else Path(trace),
     )
     return recording.result()
+
+
+def open_run(
+    system: System,
+    *,
+    output: Path | str | None = None,
+    in_process: bool = False,
+    launch: bool = True,
+    observers: Sequence[Observer] = (),
+    trace: Path | str | None = None,
+    **simulation: Any,
+) -> Session:
+    """Open a run that is stepped, asked, changed and branched from here, see docs/steering.md.
+
+    Args and errors as for `simulate`. The session stands at T_0; its slaves end with it::
+
+        with open_run(system, output="results") as run:
+            run.until(1.0)
+            run.set({"chassis.k": 2e4})
+            run.until(4.0)
+        result = run.result()
+    """
+    system = system.with_simulation(**simulation)
+    recording = Recording(settings_of(system, {}))
+    with ExitStack() as stack:
+        co_simulation = stack.enter_context(
+            _opened(
+                system,
+                None if output is None else Path(output).absolute(),
+                RunMode(in_process, launch),
+                observers,
+                recording=recording,
+                trace=None if trace is None else Path(trace).absolute(),
+            )
+        )
+        run = stack.enter_context(co_simulation.opened())
+        return Session(run, stack.pop_all(), recording.result)
 
 
 def run(
@@ -206,22 +244,48 @@ def _run(
 ) -> None:
     moment = f"before the {'first' if resumption is None else 'next'} step"
     try:
-        check_step_sizes(system)
-        with ExitStack() as stack:
-            baseline = stack.enter_context(shared_process())
-            signals = SharedProcess(baseline).run(load_signals, system)
-            if directory is not None:
-                ResultsWriter(directory, settings_of(system, {})).prepare()
-                if resumption is None:
-                    stack.enter_context(exclusive(directory))
-            traces = [] if trace is None else [stack.enter_context(closing(TraceWriter(trace)))]
-            slaves = stack.enter_context(_slaves(system, directory, mode, uploading, baseline))
-            _co_simulation(
-                system, signals, directory, mode, observers, slaves, traces, recording, resumption
-            ).run()
+        with _opened(
+            system,
+            directory,
+            mode,
+            observers,
+            recording=recording,
+            resumption=resumption,
+            uploading=uploading,
+            trace=trace,
+        ) as co_simulation:
+            co_simulation.run()
             moment = "after the last step; the results are complete"
     except KeyboardInterrupt:
         raise InterruptedRunError(f"interrupted {moment}") from None
+
+
+@contextmanager
+def _opened(
+    system: System,
+    directory: Path | None,
+    mode: RunMode,
+    observers: Sequence[Observer],
+    *,
+    recording: Recording | None = None,
+    resumption: Resumption | None = None,
+    uploading: Uploading | None = None,
+    trace: Path | None = None,
+) -> Iterator[CoSimulation]:
+    """A run that is ready to begin; at the end its slaves end."""
+    check_step_sizes(system)
+    with ExitStack() as stack:
+        baseline = stack.enter_context(shared_process())
+        signals = SharedProcess(baseline).run(load_signals, system)
+        if directory is not None:
+            ResultsWriter(directory, settings_of(system, {})).prepare()
+            if resumption is None:
+                stack.enter_context(exclusive(directory))
+        traces = [] if trace is None else [stack.enter_context(closing(TraceWriter(trace)))]
+        slaves = stack.enter_context(_slaves(system, directory, mode, uploading, baseline))
+        yield _co_simulation(
+            system, signals, directory, mode, observers, slaves, traces, recording, resumption
+        )
 
 
 def _co_simulation(  # noqa: PLR0917  what a run is made of
@@ -288,7 +352,7 @@ def _co_simulation(  # noqa: PLR0917  what a run is made of
         restorable,
         store,
         system.simulation.checkpoint_interval,
-        None if writer is None else _ResultFiles(writer, selected),
+        _Kept(selected, writer, recording),
         0 if resumed is None else resumed.checkpoint.number,
     )
     return CoSimulation(
@@ -301,19 +365,30 @@ def _writes_checkpoints(system: System) -> bool:
 
 
 @dataclass(frozen=True)
-class _ResultFiles:
-    """Implements `ResultFiles`."""
+class _Kept:
+    """Implements `ResultFiles`, with what is kept in memory."""
 
-    writer: ResultsWriter
     selected: SelectedResults
+    writer: ResultsWriter | None
+    recording: Recording | None
 
     def position(self) -> ResultPosition:
         """See `ResultFiles`."""
-        return ResultPosition(*self.writer.rows, self.selected.memory)
+        counting = self.recording if self.writer is None else self.writer
+        rows = (0, 0) if counting is None else counting.rows
+        return ResultPosition(*rows, self.selected.memory)
 
     def flush(self) -> None:
         """See `ResultFiles`."""
-        self.writer.synchronize()
+        if self.writer is not None:
+            self.writer.synchronize()
+
+    def cut(self, position: ResultPosition) -> None:
+        """See `ResultFiles`."""
+        self.selected.memory = position.selection
+        for keeper in (self.writer, self.recording):
+            if keeper is not None:
+                keeper.cut(position.points, position.attempts)
 
 
 def _restorable(slaves: Slaves, system: System, directory: Path | None) -> list[RestorableSlave]:

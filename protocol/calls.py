@@ -144,6 +144,20 @@ class SetDiscreteInputs:
 
 
 @dataclass(frozen=True, slots=True)
+class SetValues:
+    """Values of tunable parameters and of inputs that are not set otherwise, from here on.
+
+    Result: None.
+
+    Attributes:
+        values: by variable name.
+    """
+
+    verb: ClassVar[str] = "set_values"
+    values: Mapping[str, StartValue]
+
+
+@dataclass(frozen=True, slots=True)
 class DoStep:
     """fmi2DoStep. Result: `StepResult`. Anything but ``ok`` ends the program there.
 
@@ -260,6 +274,7 @@ Call = (
     | Examine
     | SetInputs
     | SetDiscreteInputs
+    | SetValues
     | DoStep
     | GetOutputs
     | GetDiscreteOutputs
@@ -281,6 +296,7 @@ CALLS: tuple[type[Call], ...] = (
     Examine,
     SetInputs,
     SetDiscreteInputs,
+    SetValues,
     DoStep,
     GetOutputs,
     GetDiscreteOutputs,

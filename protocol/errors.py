@@ -124,6 +124,12 @@ class DoublestepError(Exception):
         return error
 
 
+class SteeringError(DoublestepError):
+    """A call of a session cannot be done where the run stands. The run is as it was."""
+
+    exit_code = 2
+
+
 class ConfigurationError(DoublestepError):
     """The system file, the command line or a model's use is wrong. No step was taken.
 

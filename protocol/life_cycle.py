@@ -29,6 +29,7 @@ from protocol.calls import (
     SetDiscreteInputs,
     SetInputs,
     SetState,
+    SetValues,
     Terminate,
 )
 from protocol.errors import LifeCycleError
@@ -71,6 +72,7 @@ LIFE_CYCLE: Mapping[LifeCycleState, Mapping[type[Call], LifeCycleState]] = {
         Examine: _C,
         SetInputs: _C,
         SetDiscreteInputs: _C,
+        SetValues: _C,
         DoStep: _C,
         GetOutputs: _C,
         GetDiscreteOutputs: _C,

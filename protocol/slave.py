@@ -82,6 +82,10 @@ class Slave(ABC):
         if values:
             raise SlaveError(f"{self.description.model} has no discrete inputs")
 
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        """Set tunable parameters, and inputs that are not set otherwise, from here on: an event."""
+        raise SlaveError(f"{self.description.model} has no variables to set: {[*values]}")
+
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """The discrete outputs, one value for each."""
         return ()

@@ -40,7 +40,13 @@ Values = FloatArray | Sequence[float]
 
 
 def real(
-    name: str, unit: str = "", *, start: float = 0.0, nominal: float = 1.0, description: str = ""
+    name: str,
+    unit: str = "",
+    *,
+    start: float = 0.0,
+    nominal: float = 1.0,
+    description: str = "",
+    tunable: bool = False,
 ) -> Variable:
     """Declare a real variable; where it is listed in the `Model` says what it is.
 
@@ -50,8 +56,16 @@ def real(
         start: start value [unit]; not used for an output that is not a state.
         nominal: typical size [unit], positive; for a state it scales the absolute tolerance.
         description: one line for the user.
+        tunable: whether it may change during a run, if it is a parameter.
     """
-    return Variable(name, unit=unit, start=start, nominal=nominal, description=description)
+    return Variable(
+        name,
+        unit=unit,
+        start=start,
+        nominal=nominal,
+        description=description,
+        variability="tunable" if tunable else "continuous",
+    )
 
 
 class Model:
@@ -95,7 +109,7 @@ class Model:
             """The parameters, for type checkers."""
 
     def prepare(self) -> None:
-        """Compute what depends on the parameters alone. Called once, when they are set."""
+        """Compute what depends on the parameters alone. Called whenever they are set."""
 
     def derivatives(self, t: float, x: FloatArray, u: FloatArray) -> Values:
         """The right-hand side f: x', shape (n_x,), unit [x]/s. To be written if n_x > 0."""
@@ -139,7 +153,14 @@ def describe(model: type[Model]) -> SlaveDescription:
             for v in model.states
             if v.name not in output_names
         ),
-        *(replace(v, causality=Causality.PARAMETER, variability="fixed") for v in model.parameters),
+        *(
+            replace(
+                v,
+                causality=Causality.PARAMETER,
+                variability="tunable" if v.variability == "tunable" else "fixed",
+            )
+            for v in model.parameters
+        ),
     )
     local_states = [state.name for state in model.states if state.name not in output_names]
     has_output_derivatives = _overrides(model, "output_derivatives") or (

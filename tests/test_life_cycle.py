@@ -33,6 +33,7 @@ from protocol.calls import (
     SetDiscreteInputs,
     SetInputs,
     SetState,
+    SetValues,
     StepResult,
     StepStatus,
     Terminate,
@@ -117,6 +118,9 @@ class Recorder(Slave):
     def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
         self._hear("set_discrete_inputs")
 
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        self._hear("set_values")
+
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         self._hear("get_discrete_outputs")
         return ()
@@ -167,6 +171,7 @@ EXAMPLES: dict[type[Call], Call] = {
         ExitInitializationMode(),
         Examine(0.5, 0.25),
         SetDiscreteInputs((1,)),
+        SetValues({"p": 1.0}),
         GetDiscreteOutputs(),
         GetRecordedVariables(),
         SetInputs(np.zeros((1, 0))),
@@ -395,7 +400,7 @@ def test_saved_states_are_bounded() -> None:
     executor, slave = standing_in(LifeCycleState.STEP_COMPLETE)
     assert executor.execute([GetState(i) for i in range(2, LIMIT + 1)]).error is None
     made = slave.made
-    for call in (GetState(99), DeserializeState(99, b"state")):
+    for call in (GetState(999), DeserializeState(999, b"state")):
         executor.execute([SetState(1)])
         reply = executor.execute([call])
         assert type(reply.error) is SlaveError

@@ -22,6 +22,7 @@ from protocol.calls import (
     Initialize,
     SetDiscreteInputs,
     SetInputs,
+    SetValues,
     StepResult,
     StepStatus,
 )
@@ -84,6 +85,7 @@ _calls: st.SearchStrategy[Call] = st.one_of(
     st.builds(DoStep, _numbers, _numbers, st.booleans()),
     st.builds(GetOutputs, st.integers(0, 3)),
     st.builds(SetDiscreteInputs, st.tuples(st.integers(-5, 5), st.text(max_size=5))),
+    st.builds(SetValues, st.dictionaries(st.text(max_size=5), st.integers(-5, 5), max_size=2)),
     st.just(GetDiscreteOutputs()),
     st.just(ExitInitializationMode()),
 )

@@ -55,7 +55,8 @@ def every_check() -> list[tuple[str, Check]]:
 
 
 VALUES = {
-    *("Configure.structural_parameters", "Initialize.start_values", "SetDiscreteInputs.values"),
+    *("Configure.structural_parameters", "Initialize.start_values"),
+    *("SetDiscreteInputs.values", "SetValues.values"),
     "Variable.start",
 }
 """Values of variables, which a model may have as long as a message."""

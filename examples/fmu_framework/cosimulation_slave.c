@@ -366,10 +366,13 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nv
         if (!stored(state, vr[i]))
             return report(slave, fmi2Error, __func__,
                           "no Real variable that can be set has value reference %u", vr[i]);
-        if (index_in(vr[i], INPUT, model.inputs) < 0 && !(state->mode & CAN_SET_START_VALUES))
+        const int parameter = index_in(vr[i], PARAMETER, model.parameters);
+        const bool is_tunable = parameter >= 0 && model.is_tunable[parameter];
+        if (index_in(vr[i], INPUT, model.inputs) < 0 && !is_tunable &&
+            !(state->mode & CAN_SET_START_VALUES))
             return report(slave, fmi2Error, __func__,
-                          "value reference %u is not an input: it can be set until "
-                          "fmi2ExitInitializationMode",
+                          "value reference %u is neither an input nor a tunable parameter: it can "
+                          "be set until fmi2ExitInitializationMode",
                           vr[i]);
         if (vr[i] == MAX_STEP && !(value[i] >= 0.0))
             return report(slave, fmi2Error, __func__, "max_step is %g, not 0 or more", value[i]);

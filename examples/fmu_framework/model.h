@@ -31,6 +31,7 @@ typedef struct {
     const char *identifier; /* modelIdentifier of modelDescription.xml */
     const char *guid;       /* guid of modelDescription.xml */
     int inputs, states, outputs, parameters;
+    bool is_tunable[MAX_PARAMETERS]; /* parameters that may be set between steps */
     bool states_are_outputs; /* else they are local variables */
 
     double start[MAX_STATES];

@@ -41,8 +41,12 @@ class Chassis(Model):
     outputs = states
     parameters = (
         real("m", "kg", start=400.0, description="Mass of the chassis"),
-        real("k", "N/m", start=15000.0, description="Spring between chassis and wheel"),
-        real("d", "N.s/m", start=1000.0, description="Damper between chassis and wheel"),
+        real(
+            "k", "N/m", start=15000.0, description="Spring between chassis and wheel", tunable=True
+        ),
+        real(
+            "d", "N.s/m", start=1000.0, description="Damper between chassis and wheel", tunable=True
+        ),
         _MAX_STEP,
     )
 
@@ -62,11 +66,25 @@ class WheelOnRoad(Model):
     states = (_DISPLACEMENT, _VELOCITY)
     parameters = (
         real("m", "kg", start=40.0, description="Mass of the wheel"),
-        real("k_w", "N/m", start=150000.0, description="Spring between wheel and road"),
-        real("d_w", "N.s/m", start=0.0, description="Damper between wheel and road"),
-        real("k_c", "N/m", start=15000.0, description="Spring between chassis and wheel"),
-        real("d_c", "N.s/m", start=1000.0, description="Damper between chassis and wheel"),
-        real("z", "m", start=0.1, description="Height of the road"),
+        real(
+            "k_w", "N/m", start=150000.0, description="Spring between wheel and road", tunable=True
+        ),
+        real("d_w", "N.s/m", start=0.0, description="Damper between wheel and road", tunable=True),
+        real(
+            "k_c",
+            "N/m",
+            start=15000.0,
+            description="Spring between chassis and wheel",
+            tunable=True,
+        ),
+        real(
+            "d_c",
+            "N.s/m",
+            start=1000.0,
+            description="Damper between chassis and wheel",
+            tunable=True,
+        ),
+        real("z", "m", start=0.1, description="Height of the road", tunable=True),
         _MAX_STEP,
     )
 

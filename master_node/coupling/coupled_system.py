@@ -28,6 +28,7 @@ from master_node.coupling.external import (
     resolve_external,
 )
 from master_node.coupling.feed_through import FeedThroughOrder, Key, feed_through_order
+from master_node.coupling.overrides import OverriddenInputs
 from master_node.coupling.recorded_variables import RecordedVariables, wanted_variables
 from master_node.inputs.continuous import ExternalInputs, Jump
 from master_node.inputs.loading import load_signals
@@ -137,6 +138,7 @@ class CoupledSystem:
         external: the external inputs.
         held_feed_through: whether an output depends directly on an external input that changes
             and is held in each step, shape (m,).
+        overrides: connected inputs that are cut from their sources now.
     """
 
     parts: tuple[SlavePart, ...]
@@ -156,6 +158,7 @@ class CoupledSystem:
     recorded: RecordedVariables
     external: ExternalInputs
     held_feed_through: NDArray[np.bool_]
+    overrides: OverriddenInputs
 
     @property
     def jumps(self) -> list[Jump]:
@@ -179,6 +182,7 @@ class CoupledSystem:
         if self._transforms:
             u *= self.factor
             u[0 if u.ndim > 1 else ...] += self.offset
+        self.overrides.put_into(u)
         return u
 
     def controlled_scale(self, scale: FloatArray) -> FloatArray:
@@ -188,7 +192,7 @@ class CoupledSystem:
     def changes_of_inputs(self, changes: FloatArray) -> FloatArray:
         """Changes of inputs, shape (..., n), that belong to those of outputs, shape (..., m)."""
         u: FloatArray = changes.take(self.source, axis=-1)
-        return u * self.factor if self._transforms else u
+        return self.overrides.without_changes(u * self.factor if self._transforms else u)
 
     def scale_of_inputs(self, scale: FloatArray) -> FloatArray:
         """Tolerances of inputs, shape (n,), unit [u], from those of outputs, (m,), unit [y]."""
@@ -232,6 +236,7 @@ def resolve(
     feeding: dict[str, dict[str, ScalarConnection]] = {name: {} for name in descriptions}
     for connection in connections:
         feeding[connection.target.slave][connection.target.variable.name] = connection
+    overrides = OverriddenInputs()
     external = resolve_external(
         system, finder, connections, load_signals(system) if signals is None else signals
     )
@@ -259,6 +264,7 @@ def resolve(
         ],
         output_index,
         [external[part.name].driven for part in parts],
+        overrides,
     )
     wanted = system.results
     recorded = RecordedVariables(
@@ -301,6 +307,7 @@ def resolve(
                 for name, each in external.items()
             },
         ),
+        overrides=overrides,
     )
 
 

@@ -7,10 +7,11 @@ one. It takes no part in extrapolation and in the error norm.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from master_node.coupling.connections import ScalarConnection
+from master_node.coupling.overrides import OverriddenInputs
 from master_node.coupling.type_casts import Cast, ItemCast
 from master_node.coupling.units import Transformation
 from master_node.inputs.continuous import Jump
@@ -96,6 +97,7 @@ class DiscreteCoupling:
         output_slices: for each slave where its discrete outputs are among all of them.
         inputs: for each slave its discrete inputs that are connected, in order.
         driven: for each slave those that change from outside, in order, behind the connected ones.
+        overrides: connected inputs that are cut from their sources now.
     """
 
     keys: tuple[tuple[str, str], ...]
@@ -104,6 +106,7 @@ class DiscreteCoupling:
     output_slices: tuple[slice, ...]
     inputs: tuple[tuple[HeldInput, ...], ...]
     driven: tuple[tuple[DrivenInput, ...], ...] = ()
+    overrides: OverriddenInputs = field(default_factory=OverriddenInputs)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -149,7 +152,10 @@ class DiscreteCoupling:
         """
         if not self.holds_inputs:
             return ()
-        connected = (tuple(held.value(y, d, time) for held in inputs) for inputs in self.inputs)
+        connected = (
+            self.overrides.of_slave(slave, tuple(held.value(y, d, time) for held in inputs))
+            for slave, inputs in enumerate(self.inputs)
+        )
         if not any(self.driven):
             return tuple(connected)
         return tuple(
@@ -194,6 +200,7 @@ def couple_discrete(
     feeding: Sequence[Sequence[ScalarConnection]],
     continuous_outputs: Mapping[tuple[str, str], int],
     driven: Sequence[Sequence[DrivenInput]],
+    overrides: OverriddenInputs,
 ) -> DiscreteCoupling:
     """Give every discrete output its index.
 
@@ -202,6 +209,7 @@ def couple_discrete(
         feeding: for each slave the connections of its discrete inputs, in order.
         continuous_outputs: indices of the continuous outputs by slave and variable.
         driven: for each slave its inputs that change from outside, in order.
+        overrides: connected inputs that are cut from their sources now.
     """
     keys: list[tuple[str, str]] = []
     types: list[VariableType] = []
@@ -235,4 +243,5 @@ def couple_discrete(
             for feeds in feeding
         ),
         tuple(map(tuple, driven)),
+        overrides,
     )

@@ -23,6 +23,7 @@ from master_node.numerics.discontinuities import Defects
 from master_node.numerics.extrapolation import Polynomials
 from master_node.slaves.group import SlaveGroup
 from master_node.system.system import System
+from protocol.calls import Call
 from protocol.errors import DoublestepError
 
 Counts = Mapping[str, int]
@@ -212,6 +213,30 @@ class Method(Protocol[W, C]):
 
     def next(self, position: Position, way: W, step: C, verdict: Verdict) -> Position:
         """Where the run stands behind an accepted step, and what it tries next."""
+        ...
+
+    def behind_event(self, position: Position) -> Position:
+        """Go on from a position whose past says nothing any more, as something was changed there.
+
+        Args:
+            position: with the outputs and overrides that hold behind the change.
+        """
+        ...
+
+    def check_target(self, position: Position, time: float) -> None:
+        """Make sure that steps from a position can end at a later ``time`` [s].
+
+        Raises:
+            SteeringError: they cannot.
+        """
+        ...
+
+    def way_back(self, slave: int) -> tuple[Call, ...]:
+        """Calls that bring a slave back to T_n, where it has gone ahead on trial."""
+        ...
+
+    def forget(self) -> None:
+        """Slaves stand at T_n, and what they have saved of it does not count any more."""
         ...
 
 

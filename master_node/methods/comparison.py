@@ -29,7 +29,7 @@ from master_node.numerics.step_size_controller import NOTHING, passes
 from master_node.numerics.step_size_limits import StepSizeLimits
 from master_node.stepping.double_step import DoubleStep, DoubleStepper
 from master_node.stepping.requests import FailedStep
-from protocol.calls import StepStatus
+from protocol.calls import Call, StepStatus
 from protocol.errors import DoublestepError, SlaveError, StepSizeError
 
 log = logging.getLogger("master_node")
@@ -434,10 +434,15 @@ class ComparedSteps:
     def _behind_event(
         self, position: Position, step: DoubleStep, history: CouplingHistory
     ) -> Position:
+        return self._restarted(position, history.cut(), step.outputs)
+
+    def _restarted(
+        self, position: Position, history: CouplingHistory, outputs: Outputs
+    ) -> Position:
         """Go on behind a discontinuity: history cut, order and step size as at the start."""
         behind = Position(
-            history.cut(),
-            step.outputs,
+            history,
+            outputs,
             position.step_size,
             self.parts.restarted,
             position.search.crossed(),
@@ -445,9 +450,27 @@ class ComparedSteps:
         if self._limits.quantum is not None:
             whole = OrderMemory(self._settings.polynomial)
             behind = behind._replace(order=whole, crossings=sum(self._crossings_behind_event))
-        if step.times.end >= self._stop:
+        if history.times[0] >= self._stop:
             return behind
         return self.parts.first.chosen(behind, position.step_size)
+
+    def behind_event(self, position: Position) -> Position:
+        """See `Method`."""
+        u = self._coupled.inputs_of(position.outputs.y)
+        history = CouplingHistory.start(position.time, u, position.history.depth)
+        return self._restarted(position, history, position.outputs)
+
+    def check_target(self, position: Position, time: float) -> None:
+        """See `Method`."""
+        self._targets.check(position.time, time, together=2)
+
+    def way_back(self, slave: int) -> tuple[Call, ...]:
+        """See `Method`."""
+        return self.parts.stepper.requests.way_back(slave)
+
+    def forget(self) -> None:
+        """See `Method`."""
+        self.parts.stepper.accepted()
 
     @property
     def _crossings_behind_event(self) -> tuple[int, int]:

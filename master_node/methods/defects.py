@@ -35,7 +35,7 @@ from master_node.stepping.single_step import (
     remedy_without_rollback,
     unrepeatable,
 )
-from protocol.calls import StepStatus
+from protocol.calls import Call, StepStatus
 
 
 class DefectWay(NamedTuple):
@@ -170,6 +170,23 @@ class DefectSteps:
         if verdict.shape is Shape.JUMP:
             return self._behind_jump(following)
         return self._with_next_step_size(following, way.size)
+
+    def way_back(self, slave: int) -> tuple[Call, ...]:  # noqa: ARG002
+        """See `Method`: no slave goes ahead."""
+        return ()
+
+    def forget(self) -> None:
+        """See `Method`: nothing is saved."""
+
+    def behind_event(self, position: Position) -> Position:
+        """See `Method`."""
+        u = self._coupled.inputs_of(position.outputs.y)
+        history = CouplingHistory.start(position.time, u, position.history.depth)
+        return self._behind_jump(position._replace(history=history))
+
+    def check_target(self, position: Position, time: float) -> None:
+        """See `Method`."""
+        self._targets.check(position.time, time, together=1)
 
     def _restarted_order(self) -> OrderMemory:
         polynomial = beginning(self._ladder) if self._ladder else self._settings.polynomial

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import ulp
+from math import floor, ulp
 from typing import NamedTuple
 
 from master_node.coupling.outputs import Outputs
@@ -10,12 +10,13 @@ from master_node.coupling.step_sizes import fixed_step_limits
 from master_node.judging.available_polynomials import AvailablePolynomials
 from master_node.methods.base import Back, Ended, Setup, Verdict, ended_by
 from master_node.methods.position import Position
+from master_node.methods.targets import off_the_grid
 from master_node.numerics.extrapolation import CouplingHistory
 from master_node.numerics.order_control import OrderMemory
 from master_node.numerics.step_size_controller import fixed_steps
 from master_node.stepping.requests import BrokenOffError
 from master_node.stepping.single_step import SingleStep, SingleStepper, unrepeatable
-from protocol.calls import StepStatus
+from protocol.calls import Call, StepStatus
 from protocol.step_sums import step_to
 
 _NAN = float("nan")
@@ -125,3 +126,23 @@ class FixedSteps:
         """See `Method`."""
         history = position.history.pushed(step.end, self._coupled.inputs_of(step.outputs.y))
         return position._replace(history=history, outputs=step.outputs, steps=position.steps + 1)
+
+    def way_back(self, slave: int) -> tuple[Call, ...]:  # noqa: ARG002
+        """See `Method`: no slave goes ahead."""
+        return ()
+
+    def forget(self) -> None:
+        """See `Method`: nothing is saved."""
+
+    def behind_event(self, position: Position) -> Position:
+        """See `Method`."""
+        u = self._coupled.inputs_of(position.outputs.y)
+        return position._replace(history=CouplingHistory.start(position.time, u, self._depth))
+
+    def check_target(self, position: Position, time: float) -> None:  # noqa: ARG002
+        """See `Method`."""
+        steps = (time - self._start) / self._step_size
+        below = self._start + floor(steps) * self._step_size
+        above = min(self._stop, below + self._step_size)
+        if not any(abs(time - point) <= self._rounding for point in (below, above)):
+            raise off_the_grid(time, below, above)

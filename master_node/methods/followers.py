@@ -17,6 +17,7 @@ from master_node.numerics.step_size_controller import passes
 from master_node.stepping.double_step import DoubleStep
 from master_node.stepping.follower_slaves import LateSlaves
 from master_node.stepping.requests import BrokenOffError
+from protocol.calls import Call
 
 
 class FollowedSteps:
@@ -111,3 +112,19 @@ class FollowedSteps:
             largest=following.step_size,
         )
         return following._replace(step_size=parts.limits.bounded(bound))
+
+    def behind_event(self, position: Position) -> Position:
+        """See `Method`."""
+        return self._compared.behind_event(position)
+
+    def check_target(self, position: Position, time: float) -> None:
+        """See `Method`."""
+        self._compared.check_target(position, time)
+
+    def way_back(self, slave: int) -> tuple[Call, ...]:
+        """See `Method`."""
+        return self._compared.way_back(slave)
+
+    def forget(self) -> None:
+        """See `Method`."""
+        self._compared.forget()

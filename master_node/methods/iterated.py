@@ -15,6 +15,7 @@ from master_node.methods.position import Position
 from master_node.numerics.collocation import MIDDLE
 from master_node.stepping.double_step import DoubleStep
 from master_node.stepping.iterated_step import IteratedStepper, NotConverged
+from protocol.calls import Call
 
 
 class IteratedSteps:
@@ -103,3 +104,22 @@ class IteratedSteps:
             iteration.secants, iteration.number, step.times.step_size, iteration.loop_gain
         )
         return following._replace(coupling=after)
+
+    def behind_event(self, position: Position) -> Position:
+        """See `Method`; the coupling is as it was, but for what is known of the slaves."""
+        following = self._compared.behind_event(position)
+        if self._coupling == "implicit":
+            return following._replace(coupling=CouplingMemory(True, self._stepper.secants))
+        return following
+
+    def check_target(self, position: Position, time: float) -> None:
+        """See `Method`."""
+        self._compared.check_target(position, time)
+
+    def way_back(self, slave: int) -> tuple[Call, ...]:
+        """See `Method`."""
+        return self._compared.way_back(slave)
+
+    def forget(self) -> None:
+        """See `Method`."""
+        self._compared.forget()

@@ -21,7 +21,7 @@ from master_node.numerics.step_size_controller import (
 )
 from master_node.numerics.step_size_limits import StepSizeLimits
 from master_node.stepping.double_step import DoubleStep
-from master_node.system.system import SimulationSettings
+from master_node.system.simulation import SimulationSettings
 
 _WHOLE = 0.99
 """Part of the H that was wanted, below which something cut a double step short."""

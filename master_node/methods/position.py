@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from master_node.coupling.outputs import Outputs
+from master_node.coupling.overrides import NO_OVERRIDES, Overrides
 from master_node.methods.coupling_memory import CouplingMemory
 from master_node.numerics.discontinuities import Search, SmoothStep
 from master_node.numerics.extrapolation import CouplingHistory
 from master_node.numerics.order_control import OrderMemory
 from master_node.numerics.step_size_controller import NOTHING, ControllerMemory
+from protocol.variables import StartValue
 
 NO_SEARCH = Search.nothing(0)
 """Knowledge of jumps of a method that looks for none."""
@@ -44,6 +46,18 @@ class SecondHalf(NamedTuple):
     name: str
 
 
+class GivenValue(NamedTuple):
+    """Value that a variable was set to.
+
+    Attributes:
+        name: ``slave.variable``.
+        value: of it.
+    """
+
+    name: str
+    value: StartValue
+
+
 class Position(NamedTuple):
     """Communication point where a run stands, with what the next attempt needs to know.
 
@@ -65,6 +79,8 @@ class Position(NamedTuple):
         doubt: early return after which the next attempt is a careful one; None: there is none.
         second_half: step that must follow, as the event before it is half crossed; None: none.
         steps: number of steps taken, of a method that counts them.
+        overrides: connected inputs that are cut from their sources.
+        given: values that variables were set to during the run.
     """
 
     history: CouplingHistory
@@ -82,6 +98,8 @@ class Position(NamedTuple):
     doubt: Doubt | None = None
     second_half: SecondHalf | None = None
     steps: int = 0
+    overrides: Overrides = NO_OVERRIDES
+    given: tuple[GivenValue, ...] = ()
 
     @property
     def time(self) -> float:

@@ -131,6 +131,7 @@ class Outcome(StrEnum):
     TERMINATED = "terminated by a slave"
     INTERRUPTED = "interrupted"
     FAILED = "failed"
+    STOPPED = "stopped"
 
     @property
     def is_complete(self) -> bool:

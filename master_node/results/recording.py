@@ -44,6 +44,20 @@ class Recording:
         self._steps.append(attempt)
         self._note(attempt.points)
 
+    @property
+    def rows(self) -> tuple[int, int]:
+        """How many of results and of steps are kept."""
+        start = self._start
+        width = 1 if start is None else 1 + len(start.outputs)
+        return len(self._rows) // width, len(self._steps)
+
+    def cut(self, points: int, attempts: int) -> None:
+        """Keep only so many rows of results and of steps."""
+        if self._start is not None:
+            del self._rows[points * (1 + len(self._start.outputs)) :]
+            del self._discrete[points if self._start.discrete_names else 1 :]
+            self._steps.cut(attempts)
+
     def ended(self, end: RunEnd) -> None:
         """Note how it went."""
         self._note(end.points)

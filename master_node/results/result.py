@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import difflib
+from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from html import escape
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +29,9 @@ from protocol.signals import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+_NOTEBOOK_DPI = 80
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,6 +96,10 @@ class Result:
     def __iter__(self) -> Iterator[str]:
         return iter((*self.names, *self.discrete))
 
+    def __len__(self) -> int:
+        """How many result points there are."""
+        return len(self.time)
+
     def __repr__(self) -> str:
         rejected = int(np.count_nonzero(~self.steps["accepted"]))
         shown = [f"{name} [{unit}]" if unit else name for name, unit in self.units.items()]
@@ -101,6 +111,16 @@ class Result:
             f"{len(self.steps)} attempts, {rejected} rejected\n"
             f"  {', '.join(shown[:8])}{more}>"
         )
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the words, and the picture where there is something to draw."""
+        words = f"<pre>{escape(repr(self))}</pre>"
+        if not len(self) or not len(self.names):
+            return words
+        file = BytesIO()
+        self.plot().savefig(file, format="png", dpi=_NOTEBOOK_DPI)
+        picture = b64encode(file.getvalue()).decode()
+        return f'{words}<img alt="results over time" src="data:image/png;base64,{picture}">'
 
     def _ipython_key_completions_(self) -> list[str]:
         return ["time", *self]
@@ -125,6 +145,21 @@ class Result:
         for name in ("time", *self):
             rows[name] = self[name]
         return rows
+
+    def to_pandas(self) -> DataFrame:
+        """All rows as a data frame of pandas, with ``time`` [s] as its index.
+
+        Columns are in the order of the names, units in ``attrs["units"]``. Enumerations are
+        numbers, see `item_names`.
+
+        Raises:
+            ImportError: pandas is not installed; ``pip install doublestep[pandas]``.
+        """
+        from pandas import DataFrame, Index  # noqa: PLC0415  an extra
+
+        frame = DataFrame({name: self[name] for name in self}, index=Index(self.time, name="time"))
+        frame.attrs["units"] = dict(self.units)
+        return frame
 
     def plot(
         self,

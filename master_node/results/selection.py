@@ -83,8 +83,12 @@ class SelectedResults:
 
     @property
     def memory(self) -> SelectionMemory:
-        """Memory of the choice by now."""
+        """Memory of the choice by now; set it to go on from there."""
         return SelectionMemory(self._number, self._passed_over)
+
+    @memory.setter
+    def memory(self, memory: SelectionMemory) -> None:
+        self._number, self._passed_over = memory
 
     def started(self, start: RunStart) -> None:
         """Pass on what is chosen of it."""

@@ -79,6 +79,14 @@ class Steps:
         )
         self._texts.append(self._known.setdefault(a.limiting_variable, a.limiting_variable))
 
+    def __len__(self) -> int:
+        """How many attempts."""
+        return len(self._texts)
+
+    def cut(self, number: int) -> None:
+        """Keep only the first ``number`` attempts."""
+        del self._texts[number:], self._numbers[number * (len(_COLUMNS) - 1) :]
+
     def to_array(self) -> NDArray[np.void]:
         """A copy of ``STEPS_DTYPE``."""
         numbers = np.array(self._numbers).reshape(-1, len(_COLUMNS) - 1)

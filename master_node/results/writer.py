@@ -149,6 +149,19 @@ class ResultsWriter:
         if monotonic() >= self._next_flush:
             self._flush()
 
+    def cut(self, points: int, attempts: int) -> None:
+        """Keep only so many rows of results and of steps.
+
+        Raises:
+            ResultsError: a file cannot be written.
+        """
+        if self._start is None or (points, attempts) == self.rows:
+            return
+        self._flush()
+        self._close()
+        self._resumed = self._points, self._attempts = points, attempts
+        self._open_files(Columns.of(self._start))
+
     def ended(self, end: RunEnd) -> None:
         """Write what is left, the formats that are made at the end, and the summary.
 

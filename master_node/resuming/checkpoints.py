@@ -50,7 +50,14 @@ _COUNTERS = (
     "smallest_step_size",
     "largest_step_size",
 )
-_counters = attrgetter(*_COUNTERS)
+counted = attrgetter(*_COUNTERS)
+"""Counters of `Statistics` that belong to a point of a run."""
+
+
+def put_back(statistics: Statistics, counters: tuple[object, ...]) -> None:
+    """Let counters be what `counted` gave."""
+    for name, value in zip(_COUNTERS, counters, strict=True):
+        setattr(statistics, name, value)
 
 
 class ResultPosition(NamedTuple):
@@ -76,6 +83,10 @@ class ResultFiles(Protocol):
 
     def flush(self) -> None:
         """Bring all of it to the disk; `ResultsError`."""
+        ...
+
+    def cut(self, position: ResultPosition) -> None:
+        """Take back what was told since then; `ResultsError`."""
         ...
 
 
@@ -209,6 +220,21 @@ class Checkpoints:
         if self._slaves and self._is_due():
             self._save_states()
 
+    def went_back(self, read: Callable[[], object]) -> None:
+        """All slaves went back to a state of an earlier step, which logs need not hold any more.
+
+        Args:
+            read: reads outputs, which tell whether saved states are restored to the last bit.
+
+        Raises:
+            DoublestepError: a slave is lost for good.
+        """
+        self.settle()
+        if any(slave.can_serialize for slave in self._slaves):
+            self._save_states()
+            read()
+            self.settle()
+
     def reached(self, position: object, results: ResultMemory) -> None:
         """The run goes on from ``position``, a value that says everything about what comes next.
 
@@ -220,12 +246,25 @@ class Checkpoints:
         if self._store is None or self._files is None:
             return
         self._place = _Place(
-            self._number, position, results, self._files.position(), _counters(self._statistics)
+            self._number, position, results, self._files.position(), counted(self._statistics)
         )
         if monotonic() - self._written >= self._interval:
             self._update()
             self._write()
             self._written = monotonic()
+
+    def files_position(self) -> ResultPosition | None:
+        """How much was told so far; None: results go nowhere."""
+        return None if self._files is None else self._files.position()
+
+    def cut_files(self, position: ResultPosition) -> None:
+        """Take back what was told since then.
+
+        Raises:
+            ResultsError: a file cannot be written.
+        """
+        if self._files is not None:
+            self._files.cut(position)
 
     def broken_off(self) -> None:
         """The run did not get to its end: it can be resumed from where it stood last."""

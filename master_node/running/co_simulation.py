@@ -7,7 +7,8 @@ that the system needs (`methods/choosing.py`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -40,6 +41,7 @@ from master_node.resuming.checkpoints import NO_CHECKPOINTS, Checkpoints, Resume
 from master_node.running.interrupts import Interrupts
 from master_node.running.journal import Journal
 from master_node.running.loop import Loop
+from master_node.running.run import Run, ignored_overflow
 from master_node.slaves.group import SlaveGroup
 from master_node.system.system import System
 from protocol.calls import Terminate
@@ -213,6 +215,17 @@ class CoSimulation:
         Raises:
             DoublestepError: after the observer was told; `InterruptedRunError` for Ctrl-C.
         """
+        with self.opened() as run:
+            run.through()
+        return run.statistics
+
+    @contextmanager
+    def opened(self) -> Iterator[Run]:
+        """A run at its first communication point; at the end slaves are terminated.
+
+        Raises:
+            DoublestepError: after the observer was told; `InterruptedRunError` for Ctrl-C.
+        """
         settings = self.system.simulation
         scheme = CouplingScheme.of(self.coupled, self.system)
         outputs = self.outputs
@@ -235,21 +248,17 @@ class CoSimulation:
             for slave, restarts in self.checkpoints.restarts().items():
                 statistics.slaves[slave].restarts = restarts
 
-        interrupts = Interrupts()
         outcome, message = Outcome.FAILED, ""
         try:
             self.checkpoints.begin(statistics, update)
             try:
-                with (
-                    np.errstate(over="ignore", invalid="ignore"),  # the norm finds them
-                    interrupts.deferrable(),
-                ):
-                    note = self._steps(scheme, outputs, statistics, interrupts)
+                run = self._run(scheme, outputs, statistics)
+                yield run
             finally:
                 update()
                 self.group.restart_statistics()
             failure = self._terminate(statistics.time)
-            outcome = Outcome.TERMINATED if note else Outcome.COMPLETED
+            outcome, note = run.outcome
             message = "; ".join(filter(None, (note, failure)))
         except KeyboardInterrupt:
             outcome, message = Outcome.INTERRUPTED, f"interrupted at t={statistics.time!r} s"
@@ -263,8 +272,8 @@ class CoSimulation:
             for warning in warnings_of(statistics):
                 log.warning("%s", warning)
             self.observer.ended(RunEnd(outcome, statistics, message))
-        self.checkpoints.remove()
-        return statistics
+        if outcome.is_complete:
+            self.checkpoints.remove()
 
     def _start(self, outputs: Outputs) -> RunStart:
         """Beginning of the run, as observers are told of it."""
@@ -291,36 +300,20 @@ class CoSimulation:
             self.group.statistics,
         )
 
-    def _steps(
-        self,
-        scheme: CouplingScheme,
-        outputs: Outputs,
-        statistics: Statistics,
-        interrupts: Interrupts,
-    ) -> str:
-        """Step to the end; a slave's wish to end earlier is returned in words."""
-        loop = self._loop(scheme, outputs, statistics, interrupts)
-        while (ended := loop.advance()) is None:
-            pass
-        return ended.note
-
-    def _loop(
-        self,
-        scheme: CouplingScheme,
-        outputs: Outputs,
-        statistics: Statistics,
-        interrupts: Interrupts,
-    ) -> Loop:
+    def _run(self, scheme: CouplingScheme, outputs: Outputs, statistics: Statistics) -> Run:
         setup = Setup(self.group, self.coupled, scheme, self.system)
-        method = method_of(setup)
+        method, interrupts = method_of(setup), Interrupts()
         grid, start = self.system.simulation.output_grid, setup.start
         results = ResultPoints(grid, self.coupled, scheme.has_derivative, start, outputs)
-        if self.resumed is None:
-            position = method.begin(outputs)
-        else:
-            position, results.memory = self.resumed.place(Position)
+        with interrupts.deferrable(), ignored_overflow():
+            if self.resumed is None:
+                position = method.begin(outputs)
+            else:
+                position, results.memory = self.resumed.place(Position)
+                self.coupled.overrides.set(position.overrides)
         journal = Journal(results, self.observer, statistics, interrupts)
-        return Loop(method, position, journal, self.checkpoints, setup.missing)
+        loop = Loop(method, position, journal, self.checkpoints, setup.missing)
+        return Run(setup, method, loop, journal, self.checkpoints)
 
     def _terminate(self, time: float) -> str:
         """Terminate all slaves at the end [s]; the results are complete, whatever they say to it.

@@ -21,7 +21,8 @@ class Interrupts:
 
     def __init__(self) -> None:
         self._handlers: dict[int, Any] = {}
-        self._is_held = False
+        self._holders = 0
+        self._is_patient = False
         self._waiting: list[int] = []
 
     @contextmanager
@@ -43,18 +44,29 @@ class Interrupts:
                     signal.signal(taken, handler)
             self._handlers.clear()
 
+    @contextmanager
+    def until_step_ends(self) -> Iterator[None]:
+        """Signals wait while this lasts; a second one of the same kind does not."""
+        self._is_patient = True
+        try:
+            with self:
+                yield
+        finally:
+            self._is_patient = False
+
     def __enter__(self) -> None:
         """From here on signals wait."""
-        self._is_held = True
+        self._holders += 1
 
     def __exit__(self, *_: object) -> None:
         """Those that came meanwhile come now."""
-        self._is_held = False
-        while self._waiting:
+        self._holders -= 1
+        while self._waiting and not self._holders:
             self._handle(self._waiting.pop(), None)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._is_held:
+        is_second = self._is_patient and self._holders == 1 and number in self._waiting
+        if self._holders and not is_second:
             self._waiting.append(number)
         else:
             self._handlers[number](number, frame)

@@ -23,7 +23,7 @@ class Journal:
         interrupts: wait while an attempt is told and counted.
 
     Attributes:
-        results: as above.
+        results, statistics, interrupts: as above.
     """
 
     def __init__(
@@ -35,8 +35,8 @@ class Journal:
     ) -> None:
         self.results = results
         self._observer = observer
-        self._statistics = statistics
-        self._interrupts = interrupts
+        self.statistics = statistics
+        self.interrupts = interrupts
 
     def accepted(self, step: Candidate, verdict: Verdict) -> None:
         """Tell of an accepted step."""
@@ -48,7 +48,7 @@ class Journal:
             points = self.results.reached(reached, order)
         if verdict.shape is Shape.EVENT_AT_END:
             self.results.cut(reached[-1])
-        if verdict.remark and not self._statistics.steps_above_tolerance:
+        if verdict.remark and not self.statistics.steps_above_tolerance:
             log.warning("%s", verdict.remark)
         attempt = Attempt(
             step.begin,
@@ -61,8 +61,8 @@ class Journal:
             points,
             step.iterations,
         )
-        with self._interrupts:
-            count_accepted(self._statistics, step.step_size, reached)
+        with self.interrupts:
+            count_accepted(self.statistics, step.step_size, reached)
             self._count(verdict.counts)
             self._observer.attempted(attempt)
 
@@ -70,11 +70,11 @@ class Journal:
         """Tell of an attempt from T_n = ``time`` [s] that was rejected."""
         order, slopes = highest(back.polynomials)
         attempt = Attempt(time, back.step_size, order, slopes, back.norm, False, back.reason)
-        with self._interrupts:
-            self._statistics.rejected_double_steps += 1
+        with self.interrupts:
+            self.statistics.rejected_double_steps += 1
             self._count(back.counts)
             self._observer.attempted(attempt)
 
     def _count(self, counts: Counts) -> None:
         for name, number in counts.items():
-            setattr(self._statistics, name, getattr(self._statistics, name) + number)
+            setattr(self.statistics, name, getattr(self.statistics, name) + number)

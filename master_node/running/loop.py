@@ -74,8 +74,13 @@ class Loop:
                 return committed
             self._checkpoints.settle()
             self._journal.accepted(*committed)
-            self._moved_to(method.next(position, way, *committed))
+            following = method.next(position, way, *committed)
+            self._moved_to(following._replace(overrides=position.overrides, given=position.given))
             return None
+
+    def go_on_from(self, position: Position) -> None:
+        """Go on from another position, where all slaves stand."""
+        self._moved_to(position)
 
     def _go_back(self, back: Back) -> None:
         self._journal.rejected(self.position.time, back)

@@ -242,6 +242,8 @@ class CallLog:
     def _note_state(self, call: Call) -> None:
         if isinstance(call, SetState):
             self._go_back(call.state)
+        if isinstance(call, FreeState) and call.state not in self._marks:
+            return  # of an earlier step, which a fresh process need not have taken
         self._present.append(call)
         if isinstance(call, GetState):
             self._marks[call.state] = len(self._present), len(self._outputs)

@@ -177,6 +177,10 @@ class StepRequests:
         """The state saved at T_n is not needed any more: it is saved anew where a step begins."""
         self._saved = [False] * len(self._columns)
 
+    def way_back(self, slave: int) -> Program:
+        """Calls that bring a slave back to T_n from where a trial has led it."""
+        return (RESTORE_POINT,) if self._saved[slave] else ()
+
     def forms(self, *steps: StepForm) -> list[RequestForm]:
         """The requests that take these steps: one, unless outputs are evaluated in between."""
         if self._evaluation.is_needed:

@@ -25,6 +25,7 @@ from protocol.calls import (
     SetDiscreteInputs,
     SetInputs,
     SetState,
+    SetValues,
 )
 from protocol.errors import MalformedMessageError
 from protocol.signals import FloatArray
@@ -87,6 +88,7 @@ CALL_FIELDS: Mapping[type[Call], Mapping[str, checks.Check]] = {
     },
     SetInputs: {"derivatives": checks.array},
     SetDiscreteInputs: {"values": checks.values},
+    SetValues: {"values": checks.start_values},
     DoStep: {
         "communication_point": checks.number,
         "step_size": checks.number,

@@ -27,6 +27,7 @@ from protocol.calls import (
     SetDiscreteInputs,
     SetInputs,
     SetState,
+    SetValues,
     StepResult,
     StepStatus,
     Terminate,
@@ -95,6 +96,7 @@ class Executor:
             Examine: lambda call: examine(slave, call),
             SetInputs: lambda call: set_inputs(call.derivatives),
             SetDiscreteInputs: lambda call: slave.set_discrete_inputs(call.values),
+            SetValues: lambda call: slave.set_values(call.values),
             DoStep: lambda call: do_step(
                 call.communication_point, call.step_size, call.no_set_state_prior
             ),

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from protocol.errors import SlaveError
 from protocol.slave import Slave
 
-LIMIT = 16
-"""A double step holds two; more than this is a master that forgets to free them."""
+LIMIT = 128
+"""A double step holds two, a session up to a hundred marks; more than this is a master that forgets
+to free them."""
 
 
 class SnapshotStore:

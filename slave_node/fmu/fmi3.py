@@ -283,6 +283,16 @@ class Fmi3Slave(FmuSlave):
             if self._leave_event_mode():
                 raise SlaveError("the FMU wants to terminate after its discrete inputs changed")
 
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        """See `Slave`; goes through event mode if there is one."""
+        if not self._has_event_mode:
+            super().set_values(values)
+            return
+        self._fmi3.call(self._fmi3.fmu.enterEventMode)
+        super().set_values(values)
+        if self._leave_event_mode():
+            raise SlaveError("the FMU wants to terminate after variables were set")
+
     # ---- Steps --------------------------------------------------------------------------------
 
     def set_inputs(self, derivatives: FloatArray) -> None:

@@ -7,7 +7,7 @@ C types nor loops over variables in Python.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from protocol.calls import RecordedValues
 from protocol.description import SlaveDescription
@@ -99,6 +99,17 @@ class FmuSlave(Slave):
         """
         self._discrete_inputs.put(values, SlaveError)
         self._discrete_inputs.send()
+
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        """See `Slave`.
+
+        Raises:
+            SlaveError: there is no such variable, a value is not of its type, or the FMU refused.
+        """
+        unknown = [name for name in values if name not in self._instance.model.places]
+        if unknown:
+            raise SlaveError(f"{self.description.model} has no variables {unknown}")
+        self._instance.set_values(values)
 
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """See `Slave`."""

@@ -186,6 +186,13 @@ class ModelExchangeSlave(FmuSlave):
             if self._leave_event_mode():
                 raise SlaveError("the FMU wants to terminate after its discrete inputs changed")
 
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        """See `Slave`; goes through event mode."""
+        self._model.enter_event_mode()
+        super().set_values(values)
+        if self._leave_event_mode():
+            raise SlaveError("the FMU wants to terminate after variables were set")
+
     # ---- Steps --------------------------------------------------------------------------------
 
     def set_inputs(self, derivatives: FloatArray) -> None:

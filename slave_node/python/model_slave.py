@@ -9,6 +9,7 @@ the inner step that it would try next, and that is part of the state.
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import struct
 import zlib
@@ -65,12 +66,14 @@ class ModelState:
         x: states, shape (n_x,), read-only.
         inputs: from ``time`` on, derivatives of shape (k + 1, n_u) over all inputs of the model.
         inner_step: the step that the integrator is to try first [s], 0 if unknown.
+        tuned: names and values of tunable parameters that have changed since the start.
     """
 
     time: float
     x: FloatArray
     inputs: InputSignal
     inner_step: float = 0.0
+    tuned: tuple[tuple[str, StartValue], ...] = ()
 
 
 class ModelSlave(Slave):
@@ -101,6 +104,7 @@ class ModelSlave(Slave):
         self._readable_names = [*self._output_names, *(self._state_names[i] for i in local)]
         self._nominal = np.array([v.nominal for v in model.states])
         self._recorded: tuple[str, ...] = ()
+        self._tunable = {v.name: v for v in model.parameters if v.variability == "tunable"}
         self.reset()
 
     # ---- Set up and tear down -----------------------------------------------------------------
@@ -145,8 +149,12 @@ class ModelSlave(Slave):
         if not 0.0 < tolerance < 1.0:
             raise ConfigurationError(f"relative tolerance {tolerance!r} is not between 0 and 1")
         self._set_up(start_time, max(float(tolerance), MIN_TOLERANCE), inputs, outputs)
-        self._columns("input", [*inputs, *discrete_inputs], self._input_names)  # each but once
-        self._held_columns = self._columns("input", discrete_inputs, self._input_names)
+        names = [*self._input_names, *self._tunable]
+        self._columns("input", [*inputs, *discrete_inputs], names)  # each but once
+        self._held_names = tuple(discrete_inputs)
+        self._prepare()
+
+    def _prepare(self) -> None:
         try:
             self._run(self._model.prepare)
         except DoublestepError:
@@ -172,7 +180,7 @@ class ModelSlave(Slave):
         """Make the model and its first state from the start values."""
         self._tolerance = tolerance
         self._input_columns = self._columns("input", inputs, self._input_names)
-        self._held_columns = list[int]()
+        self._held_names = tuple[str, ...]()
         self._output_columns = self._columns("output", outputs, self._readable_names)
         try:
             self._model = self._run(self._model_class)
@@ -259,8 +267,7 @@ class ModelSlave(Slave):
                 f"{len(self._input_columns)})"
             )
         u = np.zeros((rows, len(self._input_names)))
-        u[0] = self._start_inputs
-        u[0, self._held_columns] = self._state.inputs.derivatives[0, self._held_columns]
+        u[0] = self._state.inputs.derivatives[0]  # what is not set stays
         u[:, self._input_columns] = derivatives
         self._state = replace(self._state, inputs=InputSignal(_read_only(u)))
 
@@ -270,12 +277,45 @@ class ModelSlave(Slave):
         Raises:
             SlaveError: another number of values, or one that is no number.
         """
-        names = [self._input_names[column] for column in self._held_columns]
-        if len(values) != len(names) or not all(type(value) in (float, int) for value in values):
-            raise SlaveError(f"{list(values)!r} are no numbers for {names}")
+        if len(values) != len(self._held_names):
+            raise SlaveError(f"{list(values)!r} are no values for {[*self._held_names]}")
+        self.set_values(dict(zip(self._held_names, values, strict=True)))
+
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        """See `Slave`: inputs and tunable parameters.
+
+        Raises:
+            SlaveError: a variable is neither, a value is none of it, or ``prepare`` failed.
+        """
         u = self._state.inputs.derivatives.copy()
-        u[0, self._held_columns] = values
-        self._state = replace(self._state, inputs=InputSignal(_read_only(u)))
+        tuned = dict(self._state.tuned)
+        for name, value in values.items():
+            if name in self._tunable:
+                tuned[name] = self._tunable_value(name, value)
+            elif name not in self._input_names:
+                raise SlaveError(f"{name!r} is no input and no tunable parameter")
+            elif type(value) in (float, int):
+                u[0, self._input_names.index(name)] = value
+            else:
+                raise SlaveError(f"{value!r} is no number for {name!r}")
+        inputs = InputSignal(_read_only(u))
+        self._go_to(replace(self._state, inputs=inputs, tuned=tuple(tuned.items())))
+
+    def _tunable_value(self, name: str, value: StartValue) -> StartValue:
+        try:
+            return _converted(self._tunable[name], value)
+        except ConfigurationError as error:
+            raise SlaveError(error.cause) from None
+
+    def _go_to(self, state: ModelState) -> None:
+        """Stand at a state, with the parameters that belong to it."""
+        before, self._state = self._state.tuned, state
+        if before == state.tuned:
+            return
+        tuned = dict(state.tuned)
+        for name in self._tunable:
+            setattr(self._model, name, tuned.get(name, self._start[name]))
+        self._prepare()
 
     def do_step(
         self, communication_point: float, step_size: float, no_set_state_prior: bool
@@ -297,7 +337,7 @@ class ModelSlave(Slave):
             x, inner_step = self._integrate(state, t, reach)
             inputs = state.inputs.shifted(reach)
         inputs.derivatives.setflags(write=False)
-        self._state = ModelState(t + reach, _read_only(x), inputs, inner_step)
+        self._state = ModelState(t + reach, _read_only(x), inputs, inner_step, state.tuned)
         return StepResult(StepStatus.OK if reach == h else StepStatus.DISCARD, self._state.time)
 
     def _integrate(self, state: ModelState, t: float, reach: float) -> tuple[FloatArray, float]:
@@ -444,13 +484,14 @@ class ModelSlave(Slave):
         Raises:
             SlaveError: ``state`` is not of this model.
         """
-        self._state = self._checked(state)
+        self._go_to(self._checked(state))
 
     def free_state(self, state: object) -> None:
         """Nothing to free: a state lives as long as somebody holds it."""
 
     def serialize_state(self, state: object) -> bytes:
-        """See `Slave`. All numbers are little-endian: header, time, inner step, x, inputs.
+        """See `Slave`. All numbers are little-endian: header, time, inner step, x, inputs; then
+        the tuned parameters as JSON, if there are any.
 
         Raises:
             SlaveError: ``state`` is not of this model.
@@ -460,6 +501,8 @@ class ModelSlave(Slave):
         body = _TIMES.pack(saved.time, saved.inner_step) + b"".join(
             array.astype("<f8").tobytes() for array in (saved.x, u)
         )
+        if saved.tuned:
+            body += json.dumps(saved.tuned).encode()
         shape = (len(u), len(saved.x), u.shape[1])
         header = _HEADER.pack(_MAGIC, _VERSION, *shape, self._fingerprint, zlib.crc32(body))
         return header + body
@@ -487,16 +530,29 @@ class ModelSlave(Slave):
         expected = (len(self._nominal), len(self._input_names))
         if (n_x, n_u) != expected or not 1 <= rows <= MAX_ORDER + 1:
             raise SlaveError(f"a saved state of shape {(n_x, n_u)} instead of {expected}")
-        if len(body) != _TIMES.size + 8 * (n_x + rows * n_u) or zlib.crc32(body) != checksum:
+        numbers = n_x + rows * n_u
+        length = _TIMES.size + 8 * numbers
+        if len(body) < length or zlib.crc32(body) != checksum:
             raise SlaveError("the saved state is damaged")
         time, inner_step = _TIMES.unpack_from(body)
-        values = np.frombuffer(body, "<f8", offset=_TIMES.size).astype(float)
+        values = np.frombuffer(body, "<f8", numbers, _TIMES.size).astype(float)
         return ModelState(
             time=time,
             x=_read_only(values[:n_x]),
             inputs=InputSignal(_read_only(values[n_x:].reshape(rows, n_u))),
             inner_step=inner_step,
+            tuned=self._tuned(body[length:]),
         )
+
+    def _tuned(self, data: bytes) -> tuple[tuple[str, StartValue], ...]:
+        """Tuned parameters of a saved state."""
+        if not data:
+            return ()
+        try:
+            pairs = json.loads(data)
+            return tuple((name, self._tunable_value(name, value)) for name, value in pairs)
+        except (ValueError, KeyError, TypeError):
+            raise SlaveError("the saved state is damaged") from None
 
     def _checked(self, state: object) -> ModelState:
         if not isinstance(state, ModelState) or state.x.shape != self._nominal.shape:

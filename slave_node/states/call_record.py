@@ -23,10 +23,10 @@ from protocol.calls import (
     Initialize,
     SetDiscreteInputs,
     SetInputs,
+    SetValues,
 )
 from protocol.errors import DoublestepError, SlaveError
 from protocol.signals import MAX_ORDER
-from protocol.variables import StartValue
 from protocol.wire.programs import decode_program, encode_program
 
 _MAGIC = b"2StepRec"
@@ -41,6 +41,7 @@ _SET_DISCRETE_INPUTS = 24
 _GET_DISCRETE_OUTPUTS = 25
 _EXIT_INITIALIZATION_MODE = 26
 _GET_RECORDED_VARIABLES = 27
+_SET_VALUES = 28
 
 
 class CallRecord:
@@ -54,7 +55,7 @@ class CallRecord:
         self._initialize = initialize
         self._operations = bytearray()
         self._numbers = array("d")
-        self._discrete: list[tuple[StartValue, ...]] = []
+        self._discrete: list[SetDiscreteInputs | SetValues] = []
 
     def __len__(self) -> int:
         """Number of calls."""
@@ -76,9 +77,12 @@ class CallRecord:
                 self._numbers.extend((time, step_size))
             case GetOutputs(order=order):
                 self._operations.append(_GET_OUTPUTS + order)
-            case SetDiscreteInputs(values=values):
+            case SetDiscreteInputs():
                 self._operations.append(_SET_DISCRETE_INPUTS)
-                self._discrete.append(values)
+                self._discrete.append(call)
+            case SetValues():
+                self._operations.append(_SET_VALUES)
+                self._discrete.append(call)
             case GetDiscreteOutputs():
                 self._operations.append(_GET_DISCRETE_OUTPUTS)
             case GetRecordedVariables():
@@ -107,8 +111,8 @@ class CallRecord:
                 time, step_size = numbers[place : place + 2].tolist()
                 yield DoStep(time, step_size, bool(operation - _DO_STEP))
                 place += 2
-            elif operation == _SET_DISCRETE_INPUTS:
-                yield SetDiscreteInputs(next(discrete))
+            elif operation in (_SET_DISCRETE_INPUTS, _SET_VALUES):
+                yield next(discrete)
             elif operation == _GET_DISCRETE_OUTPUTS:
                 yield GetDiscreteOutputs()
             elif operation == _GET_RECORDED_VARIABLES:
@@ -126,21 +130,21 @@ class CallRecord:
         return record
 
     def _carried(self, operations: bytes | bytearray) -> tuple[int, int]:
-        """Number of numbers, and of tuples of discrete values, that some operations carry."""
+        """Number of numbers, and of other values, that some operations carry."""
         columns = len(self._initialize.inputs)
         numbers = sum(
             operations.count(_SET_INPUTS + order) * (order + 1) * columns
             for order in range(MAX_ORDER + 1)
         )
         numbers += 2 * sum(operations.count(_DO_STEP + prior) for prior in (0, 1))
-        return numbers, operations.count(_SET_DISCRETE_INPUTS)
+        return numbers, operations.count(_SET_DISCRETE_INPUTS) + operations.count(_SET_VALUES)
 
     def to_bytes(self) -> bytes:
         """The record for another process."""
         numbers = array("d", self._numbers)
         if sys.byteorder == "big":
             numbers.byteswap()
-        discrete = [encode_program([SetDiscreteInputs(values)]) for values in self._discrete]
+        discrete = [encode_program([call]) for call in self._discrete]
         parts = (
             encode_program([self._initialize]),
             bytes(self._operations),
@@ -187,9 +191,9 @@ def _read(data: bytes) -> CallRecord:
         (size,) = _LENGTH.unpack_from(discrete)
         values = _only_call(discrete[_LENGTH.size : _LENGTH.size + size])
         discrete = discrete[_LENGTH.size + size :]
-        if not isinstance(values, SetDiscreteInputs):
-            raise ValueError("discrete inputs are something else")  # noqa: TRY004
-        record._discrete.append(values.values)
+        if not isinstance(values, SetDiscreteInputs | SetValues):
+            raise ValueError("values are something else")  # noqa: TRY004
+        record._discrete.append(values)
     if not _KNOWN.issuperset(operations):
         raise ValueError("it holds an unknown call")
     if record._carried(operations) != (len(record._numbers), len(record._discrete)):
@@ -211,5 +215,6 @@ _KNOWN = frozenset(
         _GET_DISCRETE_OUTPUTS,
         _EXIT_INITIALIZATION_MODE,
         _GET_RECORDED_VARIABLES,
+        _SET_VALUES,
     }
 )

@@ -33,6 +33,7 @@ from protocol.calls import (
     Reset,
     SetDiscreteInputs,
     SetInputs,
+    SetValues,
     StepResult,
     Terminate,
 )
@@ -312,6 +313,10 @@ class ForkSlave(Slave):
         """See `Slave`; as `set_inputs`."""
         self._pending.append(SetDiscreteInputs(tuple(values)))
         self._outputs = self._discrete_outputs = None
+
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        """See `Slave`; what the model says to them comes at once."""
+        self._run(SetValues(dict(values)))
 
     def do_step(
         self, communication_point: float, step_size: float, no_set_state_prior: bool

@@ -23,6 +23,7 @@ from protocol.calls import (
     RecordedValues,
     SetDiscreteInputs,
     SetInputs,
+    SetValues,
     StepResult,
     StepStatus,
 )
@@ -126,6 +127,11 @@ class ReplaySlave(Slave):
         """See `Slave`."""
         self._slave.set_discrete_inputs(values)
         self._record.add(SetDiscreteInputs(tuple(values)))
+
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        """See `Slave`."""
+        self._slave.set_values(values)
+        self._record.add(SetValues(dict(values)))
 
     def do_step(
         self, communication_point: float, step_size: float, no_set_state_prior: bool

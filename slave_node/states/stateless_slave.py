@@ -76,6 +76,10 @@ class StatelessSlave(Slave):
         """See `Slave`."""
         return self._slave.get_outputs(order)
 
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        """See `Slave`."""
+        self._slave.set_values(values)
+
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """See `Slave`."""
         return self._slave.get_discrete_outputs()

@@ -225,6 +225,10 @@ class SubstepSlave(Slave):
         """See `Slave`."""
         self._slave.set_discrete_inputs(values)
 
+    def set_values(self, values: Mapping[str, StartValue]) -> None:
+        """See `Slave`."""
+        self._slave.set_values(values)
+
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """See `Slave`."""
         return self._slave.get_discrete_outputs()

@@ -20,6 +20,7 @@ const Model model = {
     .inputs = 2,
     .states = 2,
     .parameters = 3,
+    .is_tunable = {[k] = true, [d] = true},
     .states_are_outputs = true,
     .nominal = {1.0, 1.0},
     .parameter_start = {[m] = 400.0, [k] = 15000.0, [d] = 1000.0},

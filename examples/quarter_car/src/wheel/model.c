@@ -24,6 +24,7 @@ const Model model = {
     .inputs = 2,
     .states = 2,
     .parameters = 6,
+    .is_tunable = {[k_w] = true, [d_w] = true, [k_c] = true, [d_c] = true, [z] = true},
     .states_are_outputs = true,
     .nominal = {1.0, 1.0},
     .parameter_start = {[m] = 40.0,

@@ -47,6 +47,7 @@ const Model model = {
     .states = 2,
     .outputs = 1,
     .parameters = 6,
+    .is_tunable = {[k_w] = true, [d_w] = true, [k_c] = true, [d_c] = true, [z] = true},
     .states_are_outputs = false,
     .nominal = {1.0, 1.0},
     .parameter_start = {[m] = 40.0,
