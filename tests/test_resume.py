@@ -24,7 +24,6 @@ from master_node.methods.position import Position
 from master_node.numerics.discontinuities import Search, SmoothStep
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
 from master_node.numerics.order_control import OrderMemory
-from master_node.results import completion
 from master_node.results.files import cannot_write
 from master_node.resuming.json_values import from_plain, to_plain
 from protocol.errors import ConfigurationError, InterruptedRunError, ResultsError
@@ -205,8 +204,9 @@ class Untold:
 KILLED = """
 import os, signal, sys
 from master_node import load_system, simulate
-from master_node.results import completion
-setattr(completion, sys.argv[1], lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+from importlib import import_module
+module, name = sys.argv[1].split()
+setattr(import_module(module), name, lambda *_: os.kill(os.getpid(), signal.SIGKILL))
 simulate(load_system(sys.argv[2]), output=sys.argv[3], in_process=True)
 """
 
@@ -219,7 +219,7 @@ def _disk_full(path: Path, *_: object) -> None:
     raise cannot_write(path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
 
 
-@pytest.mark.parametrize("what", ["_make_parquet", "_make_mat"])
+@pytest.mark.parametrize("what", ["parquet_file write_parquet", "dymola_mat write_mat"])
 @pytest.mark.parametrize("interval", [60, 0])
 @pytest.mark.parametrize("accident", ["kill", "Ctrl-C", "full disk"])
 def test_results_that_were_not_completed(
@@ -229,12 +229,20 @@ def test_results_that_were_not_completed(
 
     Until then all rows can be read, and nothing says that the run is complete.
     """
+    module, name = f"master_node.results.{what}".split()
     settings = f"stop_time = 0.3\ncheckpoint_interval = {interval}\n"
     system = car(tmp_path, settings, "formats = ['csv', 'parquet', 'mat']\n")
     out = tmp_path / "out"
     simulate(system, output=tmp_path / "whole", in_process=True)
     if accident == "kill":
-        words = [sys.executable, "-c", KILLED, what, str(tmp_path / "car.toml"), str(out)]
+        words = [
+            sys.executable,
+            "-c",
+            KILLED,
+            f"{module} {name}",
+            str(tmp_path / "car.toml"),
+            str(out),
+        ]
         assert subprocess.run(words, timeout=60, check=False).returncode == -signal.SIGKILL
         assert Result.load(out).summary == {}
     else:
@@ -244,7 +252,8 @@ def test_results_that_were_not_completed(
             else (ResultsError, "No space left on device; free space")
         )
         with monkeypatch.context() as patch:
-            patch.setattr(completion, what, _interrupt if accident == "Ctrl-C" else _disk_full)
+            accident_of = _interrupt if accident == "Ctrl-C" else _disk_full
+            patch.setattr(f"{module}.{name}", accident_of)
             remedy = f"`master-node resume {out}` completes them$"
             with pytest.raises(error, match=f"{words}.*; (then )?{remedy}"):
                 simulate(system, output=out, in_process=True)
