@@ -165,7 +165,10 @@ def _disturbed(system: DrawnSystem, nemesis: _Nemesis, folder: Path, router: str
         left = cast.left()
     _law(_exit_codes(nemesis.faults, system) >= {*codes}, f"exit codes {codes}: {_errors(cast)}")
     of_services = {code for _, code in ended}
-    _law(_codes_of_services(nemesis.faults) >= of_services, f"slaves or agents end so: {ended}")
+    _law(
+        _codes_of_services(nemesis.faults, system) >= of_services,
+        f"slaves or agents end so: {ended}",
+    )
     _law(not left, f"processes are left: {left}")
     for name, text in cast.told().items():
         _law("Traceback" not in text, f"a traceback of {name}:\n{text}")
@@ -185,10 +188,15 @@ def _exit_codes(faults: Sequence[Fault], system: DrawnSystem) -> set[int]:
     return codes
 
 
-def _codes_of_services(faults: Sequence[Fault]) -> set[int | None]:
-    """With which slaves by hand and agents may end."""
-    is_killed = any(fault.kind == "kill" and fault.part in _SERVICES for fault in faults)
-    return {0, -9} if is_killed else {0}
+def _codes_of_services(faults: Sequence[Fault], system: DrawnSystem) -> set[int | None]:
+    """Exit codes of slaves by hand and agents: 3 if a model's process died while it was loaded."""
+    kills = [fault for fault in faults if fault.kind == "kill"]
+    codes: set[int | None] = {0}
+    if any(fault.part in _SERVICES for fault in kills):
+        codes.add(-9)
+    if system.way == "served" and any(f.part == "worker" and not f.attempt for f in kills):
+        codes.add(3)
+    return codes
 
 
 def _is_lost(fault: Fault, system: DrawnSystem, is_started_again: bool) -> bool:
