@@ -16,7 +16,7 @@ from protocol.errors import HostLimitError, SlaveKilledError
 from protocol.host.python_processes import python_command
 from protocol.host.threads import LIMITS
 from slave_node.states.channel import PROCESS, Channel
-from slave_node.states.fork_keeper import OBITUARY
+from slave_node.states.obituaries import OBITUARY
 from slave_node.states.repeating import RepeatingPart
 
 _IDLE_TIME = 1.0

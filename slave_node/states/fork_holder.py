@@ -28,7 +28,7 @@ from slave_node.execution.executor import Executor
 from slave_node.models import load_model
 from slave_node.states.channel import DURATION, PROCESS, Channel, Message
 from slave_node.states.fork_hindrances import ForkHindrances, reopen
-from slave_node.states.fork_keeper import report
+from slave_node.states.obituaries import report
 from slave_node.states.step_message import execute_step
 
 _CHILD = frozenset({signal.SIGCHLD})

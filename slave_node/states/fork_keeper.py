@@ -5,7 +5,7 @@ The keeper adopts those whose parent is gone, buries the dead, reports how they 
 all of them, even in the middle of a step, when its standard input closes: the other end is with the
 slave that started it, and closes at the latest with that process.
 
-It imports nothing but the standard library, and so stays small.
+It imports hardly more than the standard library, and so stays small.
 """
 
 from __future__ import annotations
@@ -16,11 +16,8 @@ import signal
 import socket
 import sys
 import traceback
-from contextlib import suppress
-from struct import Struct
 
-OBITUARY = Struct("<qq")
-"""Process id, and how it ended as `os.waitpid` tells."""
+from slave_node.states.obituaries import report
 
 _PR_SET_CHILD_SUBREAPER = 36
 _LIFELINE = 0
@@ -69,13 +66,6 @@ def _hold(channel: int, obituaries: int) -> None:
     finally:
         sys.stderr.flush()
         os._exit(exit_code)
-
-
-def report(obituaries: int, pid: int, status: int) -> None:
-    """Write down how a process died, unless it ended as it should."""
-    if status:
-        with suppress(OSError):  # they are no longer read
-            os.write(obituaries, OBITUARY.pack(pid, status))
 
 
 def _bury(obituaries: int) -> None:
