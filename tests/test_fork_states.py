@@ -79,6 +79,10 @@ def _command_line(process: psutil.Process) -> list[str]:
         return []
 
 
+KILLED = "died by SIGKILL|nothing tells why"
+"""Ends of what is said of a killed saved state."""
+
+
 def living(processes: set[psutil.Process]) -> set[psutil.Process]:
     """Those that are neither gone nor dead and unburied."""
     return {p for p in processes if p.is_running() and _status(p) != psutil.STATUS_ZOMBIE}
@@ -453,13 +457,15 @@ def test_a_crash_without_a_saved_state_is_the_end_until_a_reset() -> None:
 
 
 def test_a_killed_saved_state_is_named(fmu_dir: Path) -> None:
-    """As the kernel does that runs out of memory."""
+    """As the kernel does that runs out of memory. Deaths that are told before the next copy is made
+    are forgotten with it, so on a busy machine the signal may not be known any more.
+    """
     with wheel(fmu_dir, "fork") as slave:
         before = family()
         state = slave.get_state()
         (saved,) = family() - before
         saved.kill()
-        with pytest.raises(SlaveKilledError, match="died by SIGKILL"):
+        with pytest.raises(SlaveKilledError, match=KILLED):
             slave.set_state(state)
         assert slave.do_step(0.0, 1e-3, True).status is StepStatus.OK
 
@@ -478,7 +484,7 @@ def test_a_saved_state_that_is_killed_before_it_was_asked_anything(fmu_dir: Path
             victim.kill()
         wait_until(lambda: not living(victims))
         slave.set_state(state)
-        with pytest.raises(SlaveKilledError, match="died by SIGKILL"):
+        with pytest.raises(SlaveKilledError, match=KILLED):
             slave.do_step(1e-3, 1e-3, True)
 
 
