@@ -9,8 +9,10 @@ import signal
 import socket
 import subprocess
 import sys
+from collections import deque
 from contextlib import suppress
 from time import monotonic
+from typing import NamedTuple
 
 from protocol.errors import HostLimitError, SlaveKilledError
 from protocol.host.python_processes import python_command
@@ -28,6 +30,24 @@ _START = (
 )
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """A process with more cannot be forked."""
+
+
+_MOST_DEATHS = 1000
+"""Deaths that are remembered: more than the holders that a slave keeps at a time."""
+
+
+class _Death(NamedTuple):
+    """Death of a holder.
+
+    Attributes:
+        process: its process id.
+        births: how many holders had been made when it was told.
+        exit_code: -N for signal N.
+    """
+
+    process: int
+    births: int
+    exit_code: int
 
 
 class HolderFamily:
@@ -48,7 +68,8 @@ class HolderFamily:
     def __init__(self, repeating: RepeatingPart) -> None:
         self.repeating = repeating
         ours, theirs = socket.socketpair()
-        self._deaths: dict[int, int] = {}
+        self._births = 0
+        self._deaths: deque[_Death] = deque(maxlen=_MOST_DEATHS)
         self._obituaries, obituaries = os.pipe()
         os.set_blocking(self._obituaries, False)
         os.set_blocking(obituaries, False)  # a full pipe blocks no writer
@@ -91,25 +112,32 @@ class HolderFamily:
         if self._keeper.poll() is not None:
             self._kill()
 
-    def forget_deaths(self) -> None:
-        """A holder is about to be made: who had its number before must not be taken for it."""
+    def count_birth(self) -> int:
+        """Number of births, for a holder that is about to be made: `exit_code` asks for it."""
         while self._read_death():
             pass
-        self._deaths.clear()
+        self._births += 1
+        return self._births
 
-    def exit_code(self, process: int) -> int | None:
+    def exit_code(self, process: int, birth: int) -> int | None:
         """Exit code of a holder whose channel is closed, -N for signal N; None: not known.
 
-        ``process`` is 0 for one that was never met.
+        Args:
+            process: its process id; 0: it was never met.
+            birth: number of births when it was made. A death that was told before is that of
+                another one, which had its process id.
         """
         deadline = monotonic() + _OBITUARY_TIME
         reader = select.poll()
         reader.register(self._obituaries, select.POLLIN)
-        while process and process not in self._deaths:
+        while process:
+            for death in self._deaths:
+                if death.process == process and death.births >= birth:
+                    return death.exit_code
             left = deadline - monotonic()
             if left <= 0.0 or not reader.poll(left * 1e3) or not self._read_death():
-                return None
-        return self._deaths.get(process)
+                break
+        return None
 
     def _read_death(self) -> bool:
         """Note one that was written down; False: there is none now, or there will be none."""
@@ -120,7 +148,7 @@ class HolderFamily:
         if len(record) < OBITUARY.size:  # whoever could write one is gone
             return False
         process, status = OBITUARY.unpack(record)
-        self._deaths[process] = os.waitstatus_to_exitcode(status)
+        self._deaths.append(_Death(process, self._births, os.waitstatus_to_exitcode(status)))
         return True
 
     def close(self) -> None:

@@ -21,6 +21,7 @@ class HeldProcess:
         connection: our end of the socket that it serves.
         process: its process id; 0: it is still to say that it is there, see `meet`.
         original: of which it is a copy.
+        birth: number of births in the family when it was made.
     """
 
     def __init__(
@@ -29,11 +30,13 @@ class HeldProcess:
         connection: socket.socket,
         process: int = 0,
         original: HeldProcess | None = None,
+        birth: int = 0,
     ) -> None:
         self._family = family
         self._channel = family.channel(connection)
         self._process = process
         self._original = original
+        self._birth = birth
         self._owed: deque[Task] = deque()
 
     def send(self, kind: Message, payload: bytes = b"") -> None:
@@ -64,7 +67,7 @@ class HeldProcess:
         Raises:
             OSError: it is gone.
         """
-        self._family.forget_deaths()
+        birth = self._family.count_birth()
         ours, theirs = socket.socketpair()
         with theirs:
             try:
@@ -73,7 +76,7 @@ class HeldProcess:
             except OSError:
                 ours.close()
                 raise
-        return HeldProcess(self._family, ours, original=self)
+        return HeldProcess(self._family, ours, original=self, birth=birth)
 
     def follow(self, trail: Trail) -> None:
         """Let it do all that again; not waited for.
@@ -118,7 +121,7 @@ class HeldProcess:
             SlaveError: as `meet`.
         """
         self.meet()  # it may have told its number and died then
-        return death(self._family.exit_code(self._process))
+        return death(self._exit_code)
 
     def loss(self) -> SlaveKilledError:
         """The error that it died while it was asked for nothing; not to be closed before.
@@ -127,16 +130,18 @@ class HeldProcess:
             SlaveError: as `meet`.
         """
         self.meet()
-        return SlaveKilledError(
-            f"the process that held the model {how_ended(self._family.exit_code(self._process))}"
-        )
+        return SlaveKilledError(f"the process that held the model {how_ended(self._exit_code)}")
+
+    @property
+    def _exit_code(self) -> int | None:
+        return self._family.exit_code(self._process, self._birth)
 
     def _never_met(self) -> SlaveKilledError:
         """The error that it died before it stood where it was to stand."""
-        who, process = "the process that was to hold a saved state", self._process
-        if not process and self._original is not None:
-            who, process = f"{who} is not there: its original", self._original._process
-        return SlaveKilledError(f"{who} {how_ended(self._family.exit_code(process))}")
+        who, dead = "the process that was to hold a saved state", self
+        if not self._process and self._original is not None:
+            who, dead = f"{who} is not there: its original", self._original
+        return SlaveKilledError(f"{who} {how_ended(dead._exit_code)}")
 
     def close(self) -> None:
         """Let it end. Idempotent."""
