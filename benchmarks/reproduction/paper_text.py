@@ -479,13 +479,13 @@ def _constants(evidence: Evidence) -> Iterable[str]:
     )
     yield _limits_table(evidence.states)
     yield paragraph(
-        """The same for the force of displacement-force coupling, an output with feed-through. Here
+        """Limits for the force of displacement-force coupling, an output with feed-through. Here
         the paper's p_k of EST_mod are wrong without any change of H too."""
     )
     yield "![Estimate over true local error of the force](constants_feed_through.png)"
     yield _limits_table(evidence.feed_through)
     yield paragraph(
-        """How fast the exact constants become right: |quotient - 1|, the largest of the three
+        """Convergence of the exact constants: |quotient - 1|, the largest of the three
         changes of H. A mark behind k stands for a point at which the polynomial meets the
         derivative as well (`derivative_points`); the paper has no constants for these. At the
         larger H the old history of EST_Rich after a change by 0.3 reaches back over much of a swing
@@ -497,7 +497,7 @@ def _constants(evidence: Evidence) -> Iterable[str]:
     yield "With feed-through, the force:"
     yield _deviations_table(evidence.feed_through, VALUES_ONLY)
     yield paragraph(
-        """What that is worth in a run: the rows of Table 1 with step size control once more (FMUs,
+        """Effect in a run: the rows of Table 1 with step size control once more (FMUs,
         in process), with nothing changed but the constants. The steps hardly change, but for k = 1
         and 2 fewer attempts are rejected, as one would expect of an estimate that is neither too
         small after H has grown nor too large after it has shrunk."""

@@ -6,7 +6,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from master_node.coupling.coupled_system import CoupledSystem
 from master_node.coupling.scheme import CouplingScheme
@@ -62,6 +61,9 @@ class StepError(NamedTuple):
 class ErrorControl:
     """Equation (8) for one coupled system, with the estimates' constants.
 
+    Slaves without rollback have not taken their steps when a double step of others is judged:
+    their outputs do not count, and have an infinite scale.
+
     Args:
         coupled: the system, with its tolerances.
         scheme: how its slaves are coupled.
@@ -80,9 +82,12 @@ class ErrorControl:
         estimator: ErrorEstimator,
         constants: str,
     ) -> None:
-        self._count(coupled.is_controlled)
+        follows = np.isin(coupled.output_slave, scheme.late_slaves)
+        self.counts = coupled.is_controlled & ~follows
+        self.outputs = int(self.counts.sum())
+        self._counted = None if self.counts.all() else np.flatnonzero(self.counts)
         self._names = coupled.output_names
-        self._absolute_tolerance = coupled.absolute_tolerance
+        self._absolute_tolerance = np.where(follows, _INF, coupled.absolute_tolerance)
         self._relative_tolerance = coupled.relative_tolerance
         self._extrapolation = scheme.extrapolation
         self._known_ahead = scheme.known_ahead
@@ -126,12 +131,6 @@ class ErrorControl:
             if bad is not None:
                 norm, limiting = _INF, f"{self._names[bad]} is not finite"
         return StepError(difference, ratio, scale, norm, limiting)
-
-    def _count(self, counts: NDArray[np.bool_]) -> None:
-        """Let ERR be the mean over these outputs, shape (m,)."""
-        self.counts = counts
-        self.outputs = int(counts.sum())
-        self._counted = None if counts.all() else np.flatnonzero(counts)
 
     def _norm(self, error: FloatArray, scale: FloatArray) -> tuple[float, int]:
         """ERR, and the index of the output with most of it."""
@@ -199,35 +198,3 @@ class ErrorControl:
             if abs(1.0 - p) < furthest:
                 found, furthest = p, abs(1.0 - p)
         return found
-
-
-class PartialErrorControl(ErrorControl):
-    """The same over the outputs of the slaves that take double steps, where not all do.
-
-    The others have not taken their steps when a double step is judged: their outputs do not count,
-    and have an infinite scale.
-
-    Args:
-        coupled: the system, with its tolerances.
-        scheme: how its slaves are coupled.
-        estimator: EST_Rich or EST_mod.
-        constants: ``exact`` or ``paper``.
-    """
-
-    def __init__(
-        self,
-        coupled: CoupledSystem,
-        scheme: CouplingScheme,
-        estimator: ErrorEstimator,
-        constants: str,
-    ) -> None:
-        super().__init__(coupled, scheme, estimator, constants)
-        is_late = np.isin(coupled.output_slave, scheme.late_slaves)
-        self._late = np.flatnonzero(is_late)
-        self._count(coupled.is_controlled & ~is_late)
-
-    def scale(self, y: FloatArray) -> FloatArray:
-        """See `ErrorControl`; infinite for outputs of the others."""
-        scale = super().scale(y)
-        scale[self._late] = _INF
-        return scale

@@ -34,7 +34,7 @@ _INF = float("inf")
 
 
 class CouplingError(NamedTuple):
-    """What the defects of a step say.
+    """Norm of the defects of a step.
 
     Attributes:
         norm: root mean square of the weighted defects; above 1 they are beyond the tolerance.
@@ -49,7 +49,7 @@ class CouplingError(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """Of each input in a step, shape (n,) each, unit [u].
+    """Defects of a step, one per input, shape (n,) each, unit [u].
 
     Attributes:
         defects: largest distances from the polynomials.
@@ -61,7 +61,7 @@ class Measured(NamedTuple):
 
 
 class StepShape(Protocol):
-    """How polynomials are used in a step of one shape or another: their defects, and w there."""
+    """Use of polynomials in a step of one shape or another: their defects, and w there."""
 
     def reach(
         self, past: tuple[float, ...], polynomials: Polynomials, step_size: float
@@ -158,7 +158,7 @@ class DoubleStepShape:
     def _of_both_steps(
         self, past: tuple[float, ...], polynomials: Polynomials, step_size: float
     ) -> tuple[list[float], list[float]]:
-        """The same for each small step."""
+        """`reach` of each small step."""
         extrapolation = self._extrapolation
         begin, middle, end = past[0], past[0] + step_size, past[0] + 2.0 * step_size
         first, second = [], []
@@ -276,7 +276,7 @@ class CouplingDefects:
         reached: Sequence[tuple[float, FloatArray]],
         y: FloatArray,
     ) -> CouplingError:
-        """What the defects of a step say that all slaves have taken.
+        """Norm of the defects of a step that all slaves have taken.
 
         Args:
             history: inputs up to the beginning of the step.

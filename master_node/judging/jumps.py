@@ -1,4 +1,4 @@
-"""How far the inputs at the ends of the small steps are from what their polynomials said."""
+"""Distances of inputs at the ends of the small steps from what their polynomials said."""
 
 from __future__ import annotations
 

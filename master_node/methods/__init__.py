@@ -1,1 +1,1 @@
-"""How one communication step is taken, judged and followed by the next."""
+"""Methods: one communication step is taken, judged and followed by the next."""

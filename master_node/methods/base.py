@@ -34,7 +34,7 @@ NO_COUNTS: Counts = {}
 
 @dataclass(frozen=True)
 class Setup:
-    """What a method works on.
+    """Slaves, connections and settings that a method works on.
 
     Attributes:
         group: the slaves, at their first communication point.
@@ -241,3 +241,23 @@ class Method(Protocol[W, C]):
 
 
 AnyMethod = Method[Any, Any]
+
+
+class FinalSteps:
+    """Part of a `Method` whose steps cannot be taken back: no slave goes ahead on trial."""
+
+    def commit(
+        self,
+        position: Position,  # noqa: ARG002
+        step: C,
+        verdict: Verdict,
+    ) -> tuple[C, Verdict]:
+        """See `Method`: it is final already."""
+        return step, verdict
+
+    def way_back(self, slave: int) -> tuple[Call, ...]:  # noqa: ARG002
+        """See `Method`: no slave goes ahead."""
+        return ()
+
+    def forget(self) -> None:
+        """See `Method`: nothing is saved."""

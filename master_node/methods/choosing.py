@@ -8,7 +8,7 @@ from master_node.coupling.coupled_system import CoupledSystem
 from master_node.coupling.scheme import slaves_without_rollback
 from master_node.coupling.step_sizes import step_size_limits
 from master_node.judging.available_polynomials import AvailablePolynomials
-from master_node.judging.comparison import ErrorControl, PartialErrorControl
+from master_node.judging.comparison import ErrorControl
 from master_node.judging.defects import CouplingDefects, DoubleStepShape
 from master_node.judging.order import OrderSelection
 from master_node.methods.base import Method, Setup
@@ -94,7 +94,7 @@ def _followed(setup: Setup, estimator: ErrorEstimator) -> Method[Any, Any]:
     limits = step_size_limits(setup.system)
     coupling = CouplingDefects(coupled, scheme, DoubleStepShape(scheme))
     stepper = PartialDoubleStepper(setup.group, coupled, scheme, estimator)
-    control = PartialErrorControl(coupled, scheme, estimator, settings.constants)
+    control = ErrorControl(coupled, scheme, estimator, settings.constants)
     available = AvailablePolynomials(scheme.extrapolation, estimator, coupling)
     orders = _orders(setup, control, available, coupling)
     restarted = OrderMemory(settings.polynomial) if orders is None else orders.restart()
@@ -135,7 +135,7 @@ def _orders(
 
 
 def _depth(setup: Setup, estimator: ErrorEstimator, *, keeps_most: bool) -> tuple[int, int]:
-    """How many communication points are kept, and how many polynomials need."""
+    """Numbers of communication points that are kept, and that polynomials need."""
     points = estimator.points(setup.system.simulation.polynomial.order + 1)
     depth = points + setup.scheme.known_ahead + 1  # and one that a step pushes out
     return max(depth, DEPTH if keeps_most else 0), points

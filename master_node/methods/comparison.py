@@ -343,7 +343,7 @@ class ComparedSteps:
         )
 
     def _is_smallest(self, times: DoubleStepTimes, target: float) -> bool:
-        """Whether no smaller H leads from T_n to ``target`` [s]."""
+        """True if no smaller H leads from T_n to ``target`` [s]."""
         smallest = self._limits.smallest
         if times.step_size <= smallest:
             return True

@@ -13,7 +13,7 @@ from master_node.coupling.outputs import Outputs
 from master_node.coupling.step_sizes import step_size_limits
 from master_node.judging.available_polynomials import AvailablePolynomials
 from master_node.judging.defects import CouplingDefects, SingleStepShape
-from master_node.methods.base import Back, Ended, Setup, Shape, Verdict, ended_by
+from master_node.methods.base import Back, Ended, FinalSteps, Setup, Shape, Verdict, ended_by
 from master_node.methods.first_step_size import UntriedStepSize
 from master_node.methods.position import Position, SecondHalf
 from master_node.methods.targets import Targets
@@ -35,7 +35,7 @@ from master_node.stepping.single_step import (
     remedy_without_rollback,
     unrepeatable,
 )
-from protocol.calls import Call, StepStatus
+from protocol.calls import StepStatus
 
 
 class DefectWay(NamedTuple):
@@ -54,7 +54,7 @@ class DefectWay(NamedTuple):
     second_half: SecondHalf | None = None
 
 
-class DefectSteps:
+class DefectSteps(FinalSteps):
     """A method that controls H by the defects of the inputs.
 
     Args:
@@ -150,15 +150,6 @@ class DefectSteps:
         verdict = verdict._replace(limiting_variable=name, shape=Shape.JUMP)
         return verdict.counting(discontinuities=int(way.second_half is None))
 
-    def commit(
-        self,
-        position: Position,  # noqa: ARG002
-        step: SingleStep,
-        verdict: Verdict,
-    ) -> tuple[SingleStep, Verdict]:
-        """See `Method`: it is final already."""
-        return step, verdict
-
     def next(
         self, position: Position, way: DefectWay, step: SingleStep, verdict: Verdict
     ) -> Position:
@@ -170,13 +161,6 @@ class DefectSteps:
         if verdict.shape is Shape.JUMP:
             return self._behind_jump(following)
         return self._with_next_step_size(following, way.size)
-
-    def way_back(self, slave: int) -> tuple[Call, ...]:  # noqa: ARG002
-        """See `Method`: no slave goes ahead."""
-        return ()
-
-    def forget(self) -> None:
-        """See `Method`: nothing is saved."""
 
     def behind_event(self, position: Position) -> Position:
         """See `Method`."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from master_node.coupling.outputs import Outputs
 from master_node.coupling.step_sizes import fixed_step_limits
 from master_node.judging.available_polynomials import AvailablePolynomials
-from master_node.methods.base import Back, Ended, Setup, Verdict, ended_by
+from master_node.methods.base import Back, Ended, FinalSteps, Setup, Verdict, ended_by
 from master_node.methods.position import Position
 from master_node.methods.targets import off_the_grid
 from master_node.numerics.extrapolation import CouplingHistory
@@ -16,7 +16,7 @@ from master_node.numerics.order_control import OrderMemory
 from master_node.numerics.step_size_controller import fixed_steps
 from master_node.stepping.requests import BrokenOffError
 from master_node.stepping.single_step import SingleStep, SingleStepper, unrepeatable
-from protocol.calls import Call, StepStatus
+from protocol.calls import StepStatus
 from protocol.step_sums import step_to
 
 _NAN = float("nan")
@@ -35,7 +35,7 @@ class FixedWay(NamedTuple):
     size: float
 
 
-class FixedSteps:
+class FixedSteps(FinalSteps):
     """A method without an estimator: one round trip for each step.
 
     Communication points are start + n H, so that rounding does not add up, and step sizes the
@@ -107,15 +107,6 @@ class FixedSteps:
         """See `Method`: each step is accepted."""
         return Verdict(_NAN)
 
-    def commit(
-        self,
-        position: Position,  # noqa: ARG002
-        step: SingleStep,
-        verdict: Verdict,
-    ) -> tuple[SingleStep, Verdict]:
-        """See `Method`: it is final already."""
-        return step, verdict
-
     def next(
         self,
         position: Position,
@@ -126,13 +117,6 @@ class FixedSteps:
         """See `Method`."""
         history = position.history.pushed(step.end, self._coupled.inputs_of(step.outputs.y))
         return position._replace(history=history, outputs=step.outputs, steps=position.steps + 1)
-
-    def way_back(self, slave: int) -> tuple[Call, ...]:  # noqa: ARG002
-        """See `Method`: no slave goes ahead."""
-        return ()
-
-    def forget(self) -> None:
-        """See `Method`: nothing is saved."""
 
     def behind_event(self, position: Position) -> Position:
         """See `Method`."""

@@ -105,3 +105,7 @@ class Position(NamedTuple):
     def time(self) -> float:
         """T_n [s]."""
         return self.history.times[0]
+
+    def changed_as(self, other: Position) -> Position:
+        """This position, with all that users had changed at the other one."""
+        return self._replace(overrides=other.overrides, given=other.given)

@@ -95,7 +95,7 @@ class Discontinuities:
         return len(times) > 1 and times[1] < self._start
 
     def event(self, position: Position, step: DoubleStep) -> str:
-        """What changed at once in a double step, in words; "" if nothing did."""
+        """Changes at once in a double step, in words; "" if there is none."""
         event = position.event
         if event is not None and self._limits.has_reached(step.times.end, event):
             return "event"

@@ -46,7 +46,7 @@ class Recording:
 
     @property
     def rows(self) -> tuple[int, int]:
-        """How many of results and of steps are kept."""
+        """Numbers of result points and of attempts that are kept."""
         start = self._start
         width = 1 if start is None else 1 + len(start.outputs)
         return len(self._rows) // width, len(self._steps)

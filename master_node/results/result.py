@@ -97,7 +97,7 @@ class Result:
         return iter((*self.names, *self.discrete))
 
     def __len__(self) -> int:
-        """How many result points there are."""
+        """Number of result points."""
         return len(self.time)
 
     def __repr__(self) -> str:

@@ -80,7 +80,7 @@ class Steps:
         self._texts.append(self._known.setdefault(a.limiting_variable, a.limiting_variable))
 
     def __len__(self) -> int:
-        """How many attempts."""
+        """Number of attempts."""
         return len(self._texts)
 
     def cut(self, number: int) -> None:

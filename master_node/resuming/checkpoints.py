@@ -254,7 +254,7 @@ class Checkpoints:
             self._written = monotonic()
 
     def files_position(self) -> ResultPosition | None:
-        """How much was told so far; None: results go nowhere."""
+        """Numbers of result points and attempts told so far; None: results go nowhere."""
         return None if self._files is None else self._files.position()
 
     def cut_files(self, position: ResultPosition) -> None:

@@ -53,7 +53,7 @@ log = logging.getLogger("master_node")
 
 
 def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
-    """What the slaves' capabilities mean for this run, as warnings for the user.
+    """Warnings of what the slaves' capabilities mean for this run.
 
     Raises:
         ConfigurationError: an estimator was asked for and a slave cannot change its step size and
@@ -168,7 +168,7 @@ def enumerations(coupled: CoupledSystem) -> dict[str, Mapping[str, int]]:
 
 
 def _discrete_type(type_: VariableType) -> DiscreteType:
-    """What results hold for a variable of this type."""
+    """Type of the results of a variable of this type."""
     if type_.is_real:
         return "float"
     if type_.integer_range is not None:

@@ -42,7 +42,7 @@ class Loop:
         self._journal = journal
         self._checkpoints = checkpoints
         self._missing = missing
-        self._moved_to(position)
+        self.move_to(position)
 
     def advance(self, until: float = inf) -> Ended | None:
         """Take one step that is accepted, after as many attempts as that needs.
@@ -75,22 +75,19 @@ class Loop:
             self._checkpoints.settle()
             self._journal.accepted(*committed)
             following = method.next(position, way, *committed)
-            self._moved_to(following._replace(overrides=position.overrides, given=position.given))
+            self.move_to(following.changed_as(position))
             return None
 
-    def go_on_from(self, position: Position) -> None:
-        """Go on from another position, where all slaves stand."""
-        self._moved_to(position)
+    def move_to(self, position: Position) -> None:
+        """Go on from a position where all slaves stand."""
+        self._missing.note(position.outputs.y, position.time)
+        self._stands_at(position)
 
     def _go_back(self, back: Back) -> None:
         self._journal.rejected(self.position.time, back)
         if back.error is not None:
             raise back.error
         self._stands_at(back.position)
-
-    def _moved_to(self, position: Position) -> None:
-        self._missing.note(position.outputs.y, position.time)
-        self._stands_at(position)
 
     def _stands_at(self, position: Position) -> None:
         self.position = position

@@ -105,7 +105,7 @@ class Run:
 
     @property
     def setup(self) -> Setup:
-        """What is run."""
+        """Slaves, their connections and the settings."""
         return self._setup
 
     @property
@@ -115,7 +115,7 @@ class Run:
 
     @property
     def outcome(self) -> tuple[Outcome, str]:
-        """How the run has ended, and a slave's wish in words."""
+        """Outcome of the run, and a slave's wish to end earlier in words."""
         if self.ended is None:
             return Outcome.STOPPED, f"stopped at t={self.position.time!r} s"
         note = self.ended.note
@@ -229,7 +229,7 @@ class Run:
                 self._checkpoints.cut_files(mark.files)
             self.ended = mark.ended
             self._checkpoints.went_back(lambda: self._at_point(self._reading(), goes_back=False))
-            self._loop.go_on_from(mark.position)
+            self._loop.move_to(mark.position)
 
     def forget(self, mark: Mark) -> None:
         """Free the states of a mark.
@@ -293,10 +293,7 @@ class Run:
         self._journal.results.cut(ReachedPoint(position.time, *position.outputs))
         self.statistics.discontinuities += 1
         self._checkpoints.settle()
-        following = self._method.behind_event(position)
-        self._loop.go_on_from(
-            following._replace(overrides=position.overrides, given=position.given)
-        )
+        self._loop.move_to(self._method.behind_event(position).changed_as(position))
 
     # --- requests -------------------------------------------------------------------------------
 
@@ -318,10 +315,9 @@ class Run:
             programs = [
                 (*self._method.way_back(slave), *program) for slave, program in enumerate(programs)
             ]
+        assert all(programs) or not any(programs)  # slaves of a double step go ahead together
         replies = []
         if all(programs):
             replies = self._setup.group.execute_all(programs, self.position.time)
-        elif any(programs):
-            raise AssertionError  # all slaves of a double step go ahead together
         self._method.forget()
         return replies

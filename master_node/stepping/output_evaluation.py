@@ -48,7 +48,7 @@ class OutputEvaluation:
 
     @property
     def is_needed(self) -> bool:
-        """Whether there is any output to evaluate again."""
+        """True if there is any output to evaluate again."""
         return bool(self._slaves)
 
     def evaluate(

@@ -80,7 +80,7 @@ class FailedStep:
 
     @property
     def has_crashed(self) -> bool:
-        """Whether the step ended the process of its slave, which can be restored."""
+        """True if the step ended the process of its slave, which can be restored."""
         return isinstance(self.error, BrokenStepError) and self.error.is_crash
 
     @property
@@ -95,7 +95,7 @@ as far as they are known by then, shape (rows, m)."""
 
 
 class StepForm(NamedTuple):
-    """What is the same in all steps of one kind.
+    """Form of all steps of one kind.
 
     Attributes:
         before: what each slave does first: save or restore; None: what the last attempt calls for.
@@ -109,7 +109,7 @@ class StepForm(NamedTuple):
 
 
 class RequestForm(NamedTuple):
-    """What is the same in all requests of one kind.
+    """Form of all requests of one kind.
 
     Attributes:
         steps: that it holds, one or two.
@@ -257,7 +257,7 @@ class StepRequests:
         return list(map(Outputs, values, self._discrete_outputs(answers, form)))
 
     def _request_at_once(self, form: RequestForm, pieces: Sequence[Piece]) -> list[Outputs]:
-        """The same for all slaves at a time, all answers being of one shape."""
+        """Outputs of all slaves by one request to all at a time, all answers being of one shape."""
         inputs = [piece.inputs(self._unknown) for piece in pieces]
         answers = self._results(form, pieces, inputs, self._slaves)
         values = np.concatenate([answers[slave][place] for slave, place in form.outputs], axis=1)
@@ -319,7 +319,7 @@ class StepRequests:
         inputs: Sequence[FloatArray],
         slaves: Sequence[int],
     ) -> list[list[Any]]:
-        """Of the programs of these slaves; counts what was executed.
+        """Results of the programs of these slaves; counts what was executed.
 
         Raises:
             BrokenOffError: a slave did not get to the end.
@@ -370,7 +370,7 @@ def _rollbacks(calls: Sequence[Call]) -> int:
 
 
 def _columns(part: SlavePart, rows: int) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """What a slave that takes ``rows`` of derivatives gets of the inputs of the system."""
+    """Columns of the inputs of the system for a slave that takes ``rows`` of derivatives."""
     if part.external_rows:
         return lambda connected, external: part.columns(connected[:rows], external)
     own = slice(rows), part.input_slice

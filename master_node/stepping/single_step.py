@@ -127,7 +127,7 @@ def unrepeatable(failed: FailedStep, begin: float, size: float, remedy: str) -> 
 
 
 def remedy_without_rollback(slave: str) -> str:
-    """What to do about a step that a slave without rollback did not complete."""
+    """Remedy for an incomplete step of a slave without rollback."""
     table = f"[slaves.{slave}] " if slave else ""
     return (
         "the step cannot be taken back: lower largest_step_size, or let the slave's state be "

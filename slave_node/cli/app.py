@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import logging
-import sys
-
 import typer
 
-from protocol.errors import DoublestepError
-from protocol.host.logs import about, logs_json
+from protocol.host.command_errors import told_errors
 from protocol.host.standard_error import forgive_standard_error
-from protocol.host.standard_output import guarded_standard_output
-from protocol.host.terminal import say_error
 from slave_node.cli.agent import agent
 from slave_node.cli.bus import check, router
 from slave_node.cli.certificates import certificates
@@ -28,18 +22,8 @@ app = typer.Typer(
 for command in (serve, router, check, agent, certificates, inspect, validate):
     app.command()(command)
 
-log = logging.getLogger("slave_node")
-
 
 def main() -> None:
     """Entry point: errors become one line and an exit code."""
     forgive_standard_error()
-    try:
-        with guarded_standard_output():
-            app()
-    except DoublestepError as error:
-        if logs_json():
-            log.error("%s", error, extra=about(error))
-        else:
-            say_error("slave-node", error)
-        sys.exit(error.exit_code)
+    told_errors("slave-node", app)
