@@ -16,7 +16,7 @@ from master_node.hosts.opening import slaves_in_process, slaves_on_bus
 from master_node.preparing.configuring import configure
 from master_node.running.co_simulation import CoSimulation
 from master_node.slaves.group import SlaveGroup
-from protocol.calls import Configure
+from protocol.calls import Configure, Initialize
 from slave_node.loading import load_slave
 
 BLOCKS = 3
@@ -76,12 +76,14 @@ def _single_calls(model: str) -> list[tuple[str, str, str, str]]:
             )
             try:
                 slave.initialize(
-                    start_time=0.0,
-                    stop_time=None,
-                    relative_tolerance=1e-6,
-                    start_values={},
-                    inputs=("x_c", "v_c"),
-                    outputs=("x", "v"),
+                    Initialize(
+                        start_time=0.0,
+                        stop_time=None,
+                        relative_tolerance=1e-6,
+                        start_values={},
+                        inputs=("x_c", "v_c"),
+                        outputs=("x", "v"),
+                    )
                 )
                 slave.exit_initialization_mode()
                 times[kind] = _medians(slave)

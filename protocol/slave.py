@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from protocol.calls import Call, RecordedValues, Reply, StepResult
+from protocol.calls import Call, Initialize, RecordedValues, Reply, StepResult
 from protocol.description import SlaveDescription
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
@@ -35,24 +35,13 @@ class Slave(ABC):
     description: SlaveDescription
 
     @abstractmethod
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """Set up the experiment, set start values, enter initialization mode.
 
-        ``inputs`` and ``outputs`` fix the order of the columns of all arrays that follow,
-        ``discrete_inputs`` and ``discrete_outputs`` that of the values of other types.
-        ``early_return``: do_step may end at an event within the step, with ``EARLY_RETURN``.
+        Its ``inputs`` and ``outputs`` fix the order of the columns of all arrays that follow,
+        ``discrete_inputs`` and ``discrete_outputs`` that of the values of other types. With
+        ``early_return`` do_step may end at an event within the step, with ``EARLY_RETURN``.
+        ``recorded`` is for `record`, which comes before.
         """
 
     @abstractmethod

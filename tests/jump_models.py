@@ -8,11 +8,11 @@ from math import cos, factorial, sin
 
 import numpy as np
 
-from protocol.calls import StepResult, StepStatus
+from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.description import InputDerivatives, SlaveDescription, StateKind
 from protocol.signals import InputSignal
 from protocol.slave import Slave
-from protocol.variables import Causality, StartValue, Variable
+from protocol.variables import Causality, Variable
 from tests.quarter_car_case import ALL
 
 
@@ -69,22 +69,10 @@ class ExactSlave(Slave):
         """See `Slave`."""
         self.t, self.x, self.u = 0.0, self._x0, np.zeros((1, len(self._names)))
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        assert tuple(inputs) == self._names
-        self.t = start_time
+        assert experiment.inputs == self._names
+        self.t = experiment.start_time
 
     def exit_initialization_mode(self) -> None:
         """See `Slave`."""

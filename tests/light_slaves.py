@@ -5,18 +5,17 @@ Two of them make a damped oscillator: x_1' = -x_1 + 2 x_2, x_2' = -2 x_1 - x_2.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from protocol.calls import StepResult, StepStatus
+from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.description import Capabilities, InputDerivatives, SlaveDescription, StateKind
 from protocol.errors import SlaveCrashedError, SlaveError
 from protocol.signals import FloatArray
 from protocol.slave import Slave
-from protocol.variables import Causality, StartValue, Variable
+from protocol.variables import Causality, Variable
 from slave_node.execution.executor import Executor
 from slave_node.worker.process import ModelReference, execute_program
 
@@ -67,23 +66,13 @@ class LightSlave(Slave):
         self._x = self._start
         self._inputs: list[float] = []
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        if [*inputs] not in ([], ["u"]) or [*outputs] != ["x"] or start_values.keys() - {"p"}:
+        inputs, outputs = experiment.inputs, experiment.outputs
+        unknown = experiment.start_values.keys() - {"p"}
+        if inputs not in ((), ("u",)) or outputs != ("x",) or unknown:
             raise SlaveError("no such variable")
-        self._time = start_time
+        self._time = experiment.start_time
 
     def exit_initialization_mode(self) -> None:
         """See `Slave`."""

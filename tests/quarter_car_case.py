@@ -31,11 +31,11 @@ from master_node.slaves.group import SlaveGroup
 from master_node.slaves.link import LocalSlave
 from master_node.stepping.double_step import DoubleStep, DoubleStepper
 from master_node.system.summary import settings_of
-from protocol.calls import StepResult, StepStatus
+from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.description import Capabilities, InputDerivatives, SlaveDescription, StateKind
 from protocol.signals import InputSignal
 from protocol.slave import Slave
-from protocol.variables import Causality, StartValue, Variable
+from protocol.variables import Causality, Variable
 from slave_node.execution.executor import Executor
 from slave_node.loading import load_slave
 from slave_node.python.loading import load_model_class
@@ -194,22 +194,10 @@ class LinearSlave(Slave):
         """See `Slave`."""
         self.x, self.u = self._x0, np.zeros((1, len(self.system.inputs)))
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        assert tuple(inputs) == self.system.inputs
-        assert tuple(outputs) == self.system.outputs
+        assert experiment.inputs == self.system.inputs
+        assert experiment.outputs == self.system.outputs
 
     def exit_initialization_mode(self) -> None:
         """See `Slave`."""

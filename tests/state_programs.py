@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from protocol.calls import Configure
+from protocol.calls import Configure, Initialize
 from protocol.slave import Slave
 from slave_node.loading import load_slave
 
@@ -47,14 +47,16 @@ def begin(
 ) -> None:
     """From instantiated to t = 0; ``discrete`` inputs and outputs."""
     slave.initialize(
-        start_time=0.0,
-        stop_time=None,
-        relative_tolerance=1e-6,
-        start_values=start_values,  # type: ignore[arg-type]
-        inputs=inputs,
-        outputs=outputs,
-        discrete_inputs=discrete[0],
-        discrete_outputs=discrete[1],
+        Initialize(
+            start_time=0.0,
+            stop_time=None,
+            relative_tolerance=1e-6,
+            start_values=start_values,  # type: ignore[arg-type]
+            inputs=inputs,
+            outputs=outputs,
+            discrete_inputs=discrete[0],
+            discrete_outputs=discrete[1],
+        )
     )
     slave.exit_initialization_mode()
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from master_node import InputSettings, Result, System, simulate
 from master_node.inputs.discrete import legal_value
+from protocol.calls import Initialize
 from protocol.description import StateKind
 from protocol.errors import ConfigurationError, SlaveError
 from protocol.variables import Causality, StartValue, Variable, VariableType
@@ -53,9 +54,9 @@ class Switched(LinearSlave):
         )
         self.told: list[tuple[float, tuple[StartValue, ...]]] = []
 
-    def initialize(self, *, discrete_inputs: Sequence[str], **others: Any) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        self.names = tuple(discrete_inputs)
+        self.names = experiment.discrete_inputs
 
     def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
         """See `Slave`."""

@@ -252,12 +252,14 @@ def load(capability_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
             for causality in (Causality.INPUT, Causality.OUTPUT)
         }
         slave.initialize(
-            start_time=0.0,
-            stop_time=None,
-            relative_tolerance=1e-6,
-            start_values={},
-            inputs=names[Causality.INPUT],
-            outputs=names[Causality.OUTPUT],
+            Initialize(
+                start_time=0.0,
+                stop_time=None,
+                relative_tolerance=1e-6,
+                start_values={},
+                inputs=names[Causality.INPUT],
+                outputs=names[Causality.OUTPUT],
+            )
         )
         slave.exit_initialization_mode()
         slave.set_inputs(np.full((1, len(names[Causality.INPUT])), 0.01))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.calls import StepStatus
+from protocol.calls import Initialize, StepStatus
 from protocol.description import InputDerivatives, StateKind
 from protocol.errors import ModelError, SlaveError, StepRejectedError
 from protocol.signals import InputSignal
@@ -51,13 +51,15 @@ def initialized(
 ) -> Slave:
     """The slave in initialization mode."""
     slave.initialize(
-        start_time=0.0,
-        stop_time=None,
-        relative_tolerance=None,
-        start_values={"x": 0.1} if start_values is None else start_values,
-        inputs=inputs,
-        outputs=outputs,
-        discrete_outputs=discrete_outputs,
+        Initialize(
+            start_time=0.0,
+            stop_time=None,
+            relative_tolerance=None,
+            start_values={"x": 0.1} if start_values is None else start_values,
+            inputs=inputs,
+            outputs=outputs,
+            discrete_outputs=discrete_outputs,
+        )
     )
     return slave
 
@@ -268,14 +270,16 @@ def test_all_types_of_fmi_1(load: Load, all_types: Path) -> None:
     outputs = ("integer_out", "not", "string_out", "boolean_out", "minus")
     slave = load(all_types)
     slave.initialize(
-        start_time=0.0,
-        stop_time=None,
-        relative_tolerance=None,
-        start_values={"integer_in": 6},
-        inputs=(),
-        outputs=(),
-        discrete_inputs=names,
-        discrete_outputs=outputs,
+        Initialize(
+            start_time=0.0,
+            stop_time=None,
+            relative_tolerance=None,
+            start_values={"integer_in": 6},
+            inputs=(),
+            outputs=(),
+            discrete_inputs=names,
+            discrete_outputs=outputs,
+        )
     )
     assert slave.get_discrete_outputs() == (0, True, "", False, 0)  # start values
     slave.exit_initialization_mode()

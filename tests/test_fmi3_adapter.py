@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from protocol.calls import Configure, StepStatus
+from protocol.calls import Configure, Initialize, StepStatus
 from protocol.description import InputDerivatives
 from protocol.errors import ModelError, SlaveError
 from protocol.signals import InputSignal
@@ -62,15 +62,17 @@ def initialized(
 ) -> Slave:
     """The slave in initialization mode."""
     slave.initialize(
-        start_time=0.0,
-        stop_time=None,
-        relative_tolerance=1e-9,
-        start_values=start_values or {},
-        inputs=inputs,
-        outputs=outputs,
-        discrete_inputs=discrete_inputs,
-        discrete_outputs=discrete_outputs,
-        early_return=early_return,
+        Initialize(
+            start_time=0.0,
+            stop_time=None,
+            relative_tolerance=1e-9,
+            start_values=start_values or {},
+            inputs=inputs,
+            outputs=outputs,
+            discrete_inputs=discrete_inputs,
+            discrete_outputs=discrete_outputs,
+            early_return=early_return,
+        )
     )
     return slave
 

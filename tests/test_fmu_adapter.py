@@ -76,12 +76,14 @@ def start(
     """The slave at its first communication point, t = 0."""
     model = slave.description.model
     slave.initialize(
-        start_time=0.0,
-        stop_time=None,
-        relative_tolerance=tolerance,
-        start_values=start_values,
-        inputs=INPUTS[model] if inputs is None else inputs,
-        outputs=OUTPUTS[model] if outputs is None else outputs,
+        Initialize(
+            start_time=0.0,
+            stop_time=None,
+            relative_tolerance=tolerance,
+            start_values=start_values,
+            inputs=INPUTS[model] if inputs is None else inputs,
+            outputs=OUTPUTS[model] if outputs is None else outputs,
+        )
     )
     slave.exit_initialization_mode()
     return slave

@@ -11,7 +11,7 @@ import pytest
 from fmpy.model_description import read_model_description
 from scipy.linalg import expm
 
-from protocol.calls import StepStatus
+from protocol.calls import Initialize, StepStatus
 from protocol.description import InputDerivatives, StateKind
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import InputSignal
@@ -72,14 +72,16 @@ def started(
 ) -> Slave:
     """The slave at its first communication point, t = 0."""
     slave.initialize(
-        start_time=0.0,
-        stop_time=stop_time,
-        relative_tolerance=tolerance,
-        start_values=start_values or {},
-        inputs=inputs,
-        outputs=outputs,
-        discrete_outputs=discrete_outputs,
-        early_return=early_return,
+        Initialize(
+            start_time=0.0,
+            stop_time=stop_time,
+            relative_tolerance=tolerance,
+            start_values=start_values or {},
+            inputs=inputs,
+            outputs=outputs,
+            discrete_outputs=discrete_outputs,
+            early_return=early_return,
+        )
     )
     slave.exit_initialization_mode()
     return slave

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.calls import StepStatus
+from protocol.calls import Initialize, StepStatus
 from protocol.errors import ConfigurationError, ModelError, SlaveError, StepRejectedError
 from protocol.signals import InputSignal
 from protocol.variables import Causality, Variable, VariableType
@@ -88,12 +88,14 @@ def started(model, start_values=None, *, tolerance=None, inputs=None, outputs=No
     """A slave at its first communication point."""
     slave = ModelSlave(model)
     slave.initialize(
-        start_time=time,
-        stop_time=None,
-        relative_tolerance=tolerance,
-        start_values=start_values or {},
-        inputs=[v.name for v in model.inputs] if inputs is None else inputs,
-        outputs=[v.name for v in model.outputs] if outputs is None else outputs,
+        Initialize(
+            start_time=time,
+            stop_time=None,
+            relative_tolerance=tolerance,
+            start_values=start_values or {},
+            inputs=tuple(v.name for v in model.inputs) if inputs is None else inputs,
+            outputs=tuple(v.name for v in model.outputs) if outputs is None else outputs,
+        )
     )
     slave.exit_initialization_mode()
     return slave

@@ -20,7 +20,7 @@ from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 
 from master_node import Result, System, simulate
-from protocol.calls import StepStatus
+from protocol.calls import Initialize, StepStatus
 from protocol.slave import Slave
 from protocol.variables import Causality, StartValue
 from slave_node.loading import describe_model, load_slave
@@ -92,12 +92,15 @@ def load(oscillator_dir: Path, tmp_path: Path) -> Iterator[Load]:
             stack.callback(slave.close)
             variables = slave.description.variables
             slave.initialize(
-                start_time=0.5,
-                stop_time=None,
-                relative_tolerance=1e-12,
-                start_values=values or {},
-                inputs=[v.name for v in variables if v.causality is Causality.INPUT],
-                outputs=outputs or [v.name for v in variables if v.causality is Causality.OUTPUT],
+                Initialize(
+                    start_time=0.5,
+                    stop_time=None,
+                    relative_tolerance=1e-12,
+                    start_values=values or {},
+                    inputs=tuple(v.name for v in variables if v.causality is Causality.INPUT),
+                    outputs=outputs
+                    or tuple(v.name for v in variables if v.causality is Causality.OUTPUT),
+                )
             )
             slave.exit_initialization_mode()
             return slave

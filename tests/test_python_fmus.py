@@ -18,7 +18,7 @@ import pytest
 
 import protocol
 from master_node import Result, load_system, simulate
-from protocol.calls import StepResult, StepStatus
+from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.description import StateVerdict
 from protocol.errors import FatalSlaveError, ModelError
 from protocol.slave import Slave
@@ -111,12 +111,14 @@ def load(tmp_path: Path) -> Iterator[Load]:
         scratch.mkdir()
         slaves.append(load_slave(fmu.name, fmu.parent, "lag", scratch))
         slaves[-1].initialize(
-            start_time=0.0,
-            stop_time=None,
-            relative_tolerance=None,
-            start_values=start_values,
-            inputs=inputs,
-            outputs=outputs,
+            Initialize(
+                start_time=0.0,
+                stop_time=None,
+                relative_tolerance=None,
+                start_values=start_values,
+                inputs=inputs,
+                outputs=outputs,
+            )
         )
         slaves[-1].set_inputs(np.ones((1, len(inputs))))
         slaves[-1].exit_initialization_mode()

@@ -18,7 +18,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from master_node import System, simulate
-from protocol.calls import StepResult
+from protocol.calls import Initialize, StepResult
 from protocol.description import Capabilities
 from protocol.step_sums import step_to
 from tests.quarter_car_case import ALL, CHASSIS, DISPLACEMENT, WHEEL, LinearSlave, Run, run_slaves
@@ -72,11 +72,11 @@ class StrictSlave(LinearSlave):
         self.times: list[tuple[object, float]] = []
         super().__init__(*arguments)
 
-    def initialize(self, *, start_time: float, stop_time: float | None, **more: Any) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        assert stop_time is not None
-        self.time, self.told.stop = start_time, stop_time
-        super().initialize(start_time=start_time, stop_time=stop_time, **more)
+        assert experiment.stop_time is not None
+        self.time, self.told.stop = experiment.start_time, experiment.stop_time
+        super().initialize(experiment)
 
     def do_step(self, communication_point: float, step_size: float, prior: bool) -> StepResult:
         """See `Slave`."""

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
 from master_node import simulate
-from protocol.calls import Configure, StepResult, StepStatus
+from protocol.calls import Configure, Initialize, StepResult, StepStatus
 from protocol.description import InputDerivatives
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.slave import Slave
@@ -41,12 +41,14 @@ def emulated(inner: Slave, **configuration: Any) -> Slave:
     slave = with_substeps(inner, Configure(**configuration))
     system = inner.system  # type: ignore[attr-defined]
     slave.initialize(
-        start_time=0.0,
-        stop_time=None,
-        relative_tolerance=1e-6,
-        start_values={},
-        inputs=system.inputs,
-        outputs=system.outputs,
+        Initialize(
+            start_time=0.0,
+            stop_time=None,
+            relative_tolerance=1e-6,
+            start_values={},
+            inputs=system.inputs,
+            outputs=system.outputs,
+        )
     )
     slave.exit_initialization_mode()
     return slave
@@ -357,12 +359,14 @@ def test_states_go_through_bytes(fmu_dir: Path, tmp_path: Path) -> None:
         "chassis.fmu", fmu_dir, "chassis", tmp_path, configuration=Configure(input_substeps=4)
     )
     slave.initialize(
-        start_time=0.0,
-        stop_time=None,
-        relative_tolerance=1e-6,
-        start_values={},
-        inputs=CHASSIS.inputs,
-        outputs=CHASSIS.outputs,
+        Initialize(
+            start_time=0.0,
+            stop_time=None,
+            relative_tolerance=1e-6,
+            start_values={},
+            inputs=CHASSIS.inputs,
+            outputs=CHASSIS.outputs,
+        )
     )
     slave.exit_initialization_mode()
     slave.set_inputs(polynomial_rows(2, 1e-3))

@@ -204,17 +204,7 @@ class Executor:
 
     def _initialize(self, call: Initialize) -> None:
         self._slave.record(call.recorded)
-        self._slave.initialize(
-            start_time=call.start_time,
-            stop_time=call.stop_time,
-            relative_tolerance=call.relative_tolerance,
-            start_values=call.start_values,
-            inputs=call.inputs,
-            outputs=call.outputs,
-            discrete_inputs=call.discrete_inputs,
-            discrete_outputs=call.discrete_outputs,
-            early_return=call.early_return,
-        )
+        self._slave.initialize(call)
 
     def _reset(self, call: Reset) -> None:
         if call.loads:

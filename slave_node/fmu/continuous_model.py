@@ -11,9 +11,9 @@ import numpy as np
 from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 
+from protocol.calls import Initialize
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
-from protocol.variables import StartValue
 from slave_node.fmu.exchange import Buffer
 from slave_node.fmu.fmi2 import Fmi2Instance
 from slave_node.fmu.fmi3 import MAX_UPDATES, Fmi3Instance
@@ -78,14 +78,8 @@ class ContinuousModel(FmuInstance):
         """For values of these variables; inputs are filled with what the FMU has."""
 
     @abstractmethod
-    def enter_initialization_mode(
-        self,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-    ) -> None:
-        """With the experiment and start values."""
+    def enter_initialization_mode(self, experiment: Initialize) -> None:
+        """Enter initialization mode with an experiment and its start values."""
 
     @abstractmethod
     def count(self) -> tuple[int, int]:
@@ -130,17 +124,9 @@ class Fmi2Model(ContinuousModel, Fmi2Instance):
     def _fmpy_class(self) -> Callable[..., Any]:
         return FMU2Model  # type: ignore[no-any-return]
 
-    def enter_initialization_mode(
-        self,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-    ) -> None:
+    def enter_initialization_mode(self, experiment: Initialize) -> None:
         """See `ContinuousModel`."""
-        Fmi2Instance.enter_initialization_mode(
-            self, start_time, stop_time, relative_tolerance, start_values
-        )
+        Fmi2Instance.enter_initialization_mode(self, experiment)
 
     def buffers(self, names: Sequence[str], *, sets: bool) -> Buffer:
         """See `ContinuousModel`."""
@@ -182,17 +168,9 @@ class Fmi3Model(ContinuousModel, Fmi3Instance):
     def _fmpy_class(self) -> Callable[..., Any]:
         return FMU3Model  # type: ignore[no-any-return]
 
-    def enter_initialization_mode(
-        self,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-    ) -> None:
+    def enter_initialization_mode(self, experiment: Initialize) -> None:
         """See `ContinuousModel`."""
-        Fmi3Instance.enter_initialization_mode(
-            self, start_time, stop_time, relative_tolerance, start_values
-        )
+        Fmi3Instance.enter_initialization_mode(self, experiment)
 
     def buffers(self, names: Sequence[str], *, sets: bool) -> Buffer:
         """See `ContinuousModel`."""

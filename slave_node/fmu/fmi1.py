@@ -21,7 +21,7 @@ from fmpy.fmi1 import (
     fmi1CallbackFunctions,
 )
 
-from protocol.calls import RecordedValues, StepResult, StepStatus
+from protocol.calls import Initialize, RecordedValues, StepResult, StepStatus
 from protocol.errors import StepRejectedError
 from protocol.signals import FloatArray
 from protocol.variables import StartValue, VariableType
@@ -143,29 +143,18 @@ class Fmi1Slave(FmuSlave):
         self._input_signs, self._output_signs = signs(inputs), signs(outputs)
         self._output_names = tuple(outputs)
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,  # noqa: ARG002  FMI 1.0 has none for co-simulation
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,  # noqa: ARG002  it never does
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        self._bind(inputs, outputs)
-        self._discrete_inputs = self._fmi1.discrete(discrete_inputs)
-        self._discrete_outputs = self._fmi1.discrete(discrete_outputs)
-        self._discrete_names = tuple(discrete_outputs)
-        self._times = (start_time, stop_time)
+        self._bind(experiment.inputs, experiment.outputs)
+        self._discrete_inputs = self._fmi1.discrete(experiment.discrete_inputs)
+        self._discrete_outputs = self._fmi1.discrete(experiment.discrete_outputs)
+        self._discrete_names = experiment.discrete_outputs
+        self._times = (experiment.start_time, experiment.stop_time)
         self._is_initialized = False
-        at_once, _ = self._fmi1.split_start_values(start_values)
+        at_once, _ = self._fmi1.split_start_values(experiment.start_values)
         self._fmi1.set_values(at_once)
-        self._starts = {v.name: v.start for v in self.description.variables} | dict(start_values)
+        declared = {v.name: v.start for v in self.description.variables}
+        self._starts = declared | dict(experiment.start_values)
 
     def exit_initialization_mode(self) -> None:
         """See `Slave`."""

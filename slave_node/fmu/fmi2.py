@@ -15,9 +15,9 @@ from fmpy.fmi2 import (
     fmi2CallbackFunctions,
 )
 
-from protocol.calls import StepResult, StepStatus
+from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.errors import StepRejectedError
-from protocol.variables import StartValue, VariableType
+from protocol.variables import VariableType
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer
@@ -83,21 +83,17 @@ class Fmi2Instance(FmuInstance):
         call = self.function(name, VALUES_CALL)
         self.check(name, call(references.ctypes.data, len(references), *arrays))
 
-    def enter_initialization_mode(
-        self,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-    ) -> None:
+    def enter_initialization_mode(self, experiment: Initialize) -> None:
         """Set up the experiment, set start values, enter initialization mode."""
-        at_once, _ = self.split_start_values(start_values)  # there are no arrays in FMI 2.0
+        at_once, _ = self.split_start_values(
+            experiment.start_values
+        )  # there are no arrays in FMI 2.0
         fmu = self.fmu
         self.call(
             fmu.setupExperiment,
-            tolerance=relative_tolerance,
-            startTime=start_time,
-            stopTime=stop_time,
+            tolerance=experiment.relative_tolerance,
+            startTime=experiment.start_time,
+            stopTime=experiment.stop_time,
         )
         self.set_values(at_once)
         self.call(fmu.enterInitializationMode)
@@ -140,26 +136,12 @@ class Fmi2Slave(FmuSlave):
         self._inputs = instance.buffer(inputs, "fmi2SetReal", "fmi2SetRealInputDerivatives")
         self._outputs = instance.buffer(outputs, "fmi2GetReal", "fmi2GetRealOutputDerivatives")
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,  # noqa: ARG002  it never does
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        self._bind(inputs, outputs)
-        self._discrete_inputs = self._fmi2.discrete(discrete_inputs)
-        self._discrete_outputs = self._fmi2.discrete(discrete_outputs)
-        self._fmi2.enter_initialization_mode(
-            start_time, stop_time, relative_tolerance, start_values
-        )
+        self._bind(experiment.inputs, experiment.outputs)
+        self._discrete_inputs = self._fmi2.discrete(experiment.discrete_inputs)
+        self._discrete_outputs = self._fmi2.discrete(experiment.discrete_outputs)
+        self._fmi2.enter_initialization_mode(experiment)
 
     def exit_initialization_mode(self) -> None:
         """See `Slave`."""

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from fmpy.fmi3 import FMU3Slave
 
-from protocol.calls import StepResult, StepStatus
+from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
 from protocol.step_sums import step_to
@@ -86,15 +86,9 @@ class Fmi3Instance(FmuInstance):
         call = self.function(name, _BINARY_CALL if len(arrays) == 2 else VALUES_CALL_3)
         self.check(name, call(references.ctypes.data, len(references), *arrays, values))
 
-    def enter_initialization_mode(
-        self,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-    ) -> None:
+    def enter_initialization_mode(self, experiment: Initialize) -> None:
         """Set structural parameters and start values, enter initialization mode."""
-        at_once, later = self.split_start_values(start_values)
+        at_once, later = self.split_start_values(experiment.start_values)
         if self.model.structural_parameters:
             self.call(self.fmu.enterConfigurationMode)
             self.set_values(self.model.structural_parameters)
@@ -102,9 +96,9 @@ class Fmi3Instance(FmuInstance):
         self.set_values(at_once)
         self.call(
             self.fmu.enterInitializationMode,
-            tolerance=relative_tolerance,
-            startTime=start_time,
-            stopTime=stop_time,
+            tolerance=experiment.relative_tolerance,
+            startTime=experiment.start_time,
+            stopTime=experiment.stop_time,
         )
         self.set_values(later)
 
@@ -210,7 +204,7 @@ class Fmi3Slave(FmuSlave):
             t, h, no_prior, *results
         )
         self._bind((), ())
-        self._start(0.0, early_return=False)
+        self._start(Initialize())
 
     def _bind(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
         """Make the buffers for these inputs and outputs."""
@@ -222,34 +216,20 @@ class Fmi3Slave(FmuSlave):
         self._polynomials = InputPolynomials(self._inputs, self._inputs_within)
         self._outputs = instance.buffer(outputs, derivatives=self._max_order > 0)
 
-    def _start(self, time: float, *, early_return: bool) -> None:
-        self._time = self._inputs_time = time
-        self._returns_early = early_return
+    def _start(self, experiment: Initialize) -> None:
+        self._time = self._inputs_time = experiment.start_time
+        self._returns_early = experiment.early_return
         self._is_initializing = True
 
     # ---- Initialization -----------------------------------------------------------------------
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        self._bind(inputs, outputs)
-        self._discrete_inputs = self._fmi3.discrete(discrete_inputs)
-        self._discrete_outputs = self._fmi3.discrete(discrete_outputs)
-        self._start(start_time, early_return=early_return)
-        self._fmi3.enter_initialization_mode(
-            start_time, stop_time, relative_tolerance, start_values
-        )
+        self._bind(experiment.inputs, experiment.outputs)
+        self._discrete_inputs = self._fmi3.discrete(experiment.discrete_inputs)
+        self._discrete_outputs = self._fmi3.discrete(experiment.discrete_outputs)
+        self._start(experiment)
+        self._fmi3.enter_initialization_mode(experiment)
         for buffer in (self._inputs, self._inputs_within):
             self._fmi3.check("fmi3GetFloat64", buffer.fill())
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.calls import StepResult, StepStatus
+from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.errors import SlaveError, StepRejectedError
 from protocol.signals import FloatArray
 from protocol.slave import Slave
@@ -61,7 +61,7 @@ class ModelExchangeSlave(FmuSlave):
         self._saves_by_fmu = model.model.interface.saves_state
         self._solver: CVode | None = None
         self._bind((), ())
-        self._start(0.0, None, None, early_return=False)
+        self._start(Initialize())
 
     def _bind(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
         """Make the buffers for these inputs and outputs."""
@@ -69,18 +69,12 @@ class ModelExchangeSlave(FmuSlave):
         self._polynomials = InputPolynomials(self._inputs, self._model.buffers(inputs, sets=True))
         self._outputs = self._model.buffers(outputs, sets=False)
 
-    def _start(
-        self,
-        time: float,
-        stop_time: float | None,
-        tolerance: float | None,
-        *,
-        early_return: bool,
-    ) -> None:
-        self._time = self._inputs_time = self._model_time = time
-        self._stop_time = math.inf if stop_time is None else stop_time
-        self._tolerance = max(tolerance or DEFAULT_TOLERANCE, MIN_TOLERANCE)
-        self._returns_early = early_return
+    def _start(self, experiment: Initialize) -> None:
+        self._time = self._inputs_time = self._model_time = experiment.start_time
+        self._stop_time = math.inf if experiment.stop_time is None else experiment.stop_time
+        tolerance = experiment.relative_tolerance or DEFAULT_TOLERANCE
+        self._tolerance = max(tolerance, MIN_TOLERANCE)
+        self._returns_early = experiment.early_return
         self._is_initializing = True
         self._rows_set = 1
         self._first_step = 0.0
@@ -88,30 +82,16 @@ class ModelExchangeSlave(FmuSlave):
 
     # ---- Initialization -----------------------------------------------------------------------
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
-        """See `Slave`. ``relative_tolerance`` is that of the solver; times the nominal value of a
+    def initialize(self, experiment: Initialize) -> None:
+        """See `Slave`. Its relative tolerance is that of the solver; times the nominal value of a
         state it is the absolute one.
         """
-        self._discrete_inputs = self._model.discrete(discrete_inputs)
-        self._discrete_outputs = self._model.discrete(discrete_outputs)
-        self._model.continuous_places([*inputs, *outputs])
-        self._start(start_time, stop_time, relative_tolerance, early_return=early_return)
-        self._model.enter_initialization_mode(
-            start_time, stop_time, relative_tolerance, start_values
-        )
-        self._bind(inputs, outputs)
+        self._discrete_inputs = self._model.discrete(experiment.discrete_inputs)
+        self._discrete_outputs = self._model.discrete(experiment.discrete_outputs)
+        self._model.continuous_places([*experiment.inputs, *experiment.outputs])
+        self._start(experiment)
+        self._model.enter_initialization_mode(experiment)
+        self._bind(experiment.inputs, experiment.outputs)
 
     def exit_initialization_mode(self) -> None:
         """See `Slave`. The event at the start is handled."""

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import BDF, DOP853, RK23, RK45, Radau
 
-from protocol.calls import RecordedValues, StepResult, StepStatus
+from protocol.calls import Initialize, RecordedValues, StepResult, StepStatus
 from protocol.errors import (
     ConfigurationError,
     DoublestepError,
@@ -118,40 +118,31 @@ class ModelSlave(Slave):
         }
         self._set_up(0.0, DEFAULT_TOLERANCE, self._input_names, self._output_names)
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,  # noqa: ARG002  it never does
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`. Inputs that are not among ``inputs`` keep their start values, those among
         ``discrete_inputs`` what they are set to: something that is not continuous drives them.
 
-        ``relative_tolerance`` is that of the inner solver; times the nominal value of a state
-        it is the absolute one. ``stop_time`` does not matter: a model goes on as long as asked.
+        The relative tolerance is that of the inner solver; times the nominal value of a state
+        it is the absolute one. The stop time does not matter: a model goes on as long as asked.
 
         Raises:
             ConfigurationError: a name that the model does not have, or a value of the wrong type.
             SlaveError: the model's ``prepare`` failed.
         """
-        refuse_discrete(self.description, (), discrete_outputs)
-        del stop_time
-        for name, value in start_values.items():
+        refuse_discrete(self.description, (), experiment.discrete_outputs)
+        for name, value in experiment.start_values.items():
             self._start[name] = self._start_value(name, value)
-        tolerance = DEFAULT_TOLERANCE if relative_tolerance is None else relative_tolerance
+        tolerance = experiment.relative_tolerance
+        if tolerance is None:
+            tolerance = DEFAULT_TOLERANCE
         if not 0.0 < tolerance < 1.0:
             raise ConfigurationError(f"relative tolerance {tolerance!r} is not between 0 and 1")
-        self._set_up(start_time, max(float(tolerance), MIN_TOLERANCE), inputs, outputs)
+        inputs, discrete_inputs = experiment.inputs, experiment.discrete_inputs
+        accuracy = max(float(tolerance), MIN_TOLERANCE)
+        self._set_up(experiment.start_time, accuracy, inputs, experiment.outputs)
         names = [*self._input_names, *self._tunable]
         self._columns("input", [*inputs, *discrete_inputs], names)  # each but once
-        self._held_names = tuple(discrete_inputs)
+        self._held_names = discrete_inputs
         self._prepare()
 
     def _prepare(self) -> None:

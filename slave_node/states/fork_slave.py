@@ -266,35 +266,10 @@ class ForkSlave(Slave):
 
     # ---- Slave --------------------------------------------------------------------------------
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        self._family.repeating.bind(outputs, discrete_outputs)
-        self._run(
-            Initialize(
-                start_time,
-                stop_time,
-                relative_tolerance,
-                dict(start_values),
-                tuple(inputs),
-                tuple(outputs),
-                tuple(discrete_inputs),
-                tuple(discrete_outputs),
-                early_return,
-                self._recorded_names,
-            )
-        )
+        self._family.repeating.bind(experiment.outputs, experiment.discrete_outputs)
+        self._run(replace(experiment, recorded=self._recorded_names))
 
     def record(self, names: Sequence[str]) -> None:
         """See `Slave`; the holder hears of it with `initialize`."""

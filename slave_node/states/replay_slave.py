@@ -34,6 +34,7 @@ from protocol.slave import Slave
 from protocol.variables import StartValue
 from slave_node.execution.executor import Executor
 from slave_node.states.call_record import CallRecord
+from slave_node.wrapped_slave import WrappedSlave
 
 REMARK = "a restored state is computed anew from the start time: its cost grows with the time"
 _CALLS_AT_ONCE = 1000
@@ -47,7 +48,7 @@ class _Place:
     length: int
 
 
-class ReplaySlave(Slave):
+class ReplaySlave(WrappedSlave):
     """A slave around another one, whose calls it remembers.
 
     Args:
@@ -59,8 +60,8 @@ class ReplaySlave(Slave):
     """
 
     def __init__(self, load: Callable[[], Slave], reason: str) -> None:
+        super().__init__(load())
         self._load = load
-        self._slave = load()
         described = self._slave.description
         self.description = replace(
             described,
@@ -73,45 +74,10 @@ class ReplaySlave(Slave):
 
     # ---- Calls that lead to a state -----------------------------------------------------------
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
+    def initialize(self, experiment: Initialize) -> None:
         """See `Slave`."""
-        self._slave.initialize(
-            start_time=start_time,
-            stop_time=stop_time,
-            relative_tolerance=relative_tolerance,
-            start_values=start_values,
-            inputs=inputs,
-            outputs=outputs,
-            discrete_inputs=discrete_inputs,
-            discrete_outputs=discrete_outputs,
-            early_return=early_return,
-        )
-        self._record = CallRecord(
-            Initialize(
-                start_time,
-                stop_time,
-                relative_tolerance,
-                dict(start_values),
-                tuple(inputs),
-                tuple(outputs),
-                tuple(discrete_inputs),
-                tuple(discrete_outputs),
-                early_return,
-                self._recorded,
-            )
-        )
+        self._slave.initialize(experiment)
+        self._record = CallRecord(replace(experiment, recorded=self._recorded))
 
     def exit_initialization_mode(self) -> None:
         """See `Slave`."""
@@ -216,18 +182,10 @@ class ReplaySlave(Slave):
 
     # ---- Ends ---------------------------------------------------------------------------------
 
-    def terminate(self) -> None:
-        """See `Slave`."""
-        self._slave.terminate()
-
     def reset(self) -> None:
         """See `Slave`."""
         self._restart()
         self._record = CallRecord(Initialize())
-
-    def close(self) -> None:
-        """See `Slave`."""
-        self._slave.close()
 
 
 def _did_not_repeat(call: Call, how: str) -> SlaveError:

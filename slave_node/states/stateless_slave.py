@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NoReturn
 
-from protocol.calls import RecordedValues, StepResult
 from protocol.description import StateKind
 from protocol.errors import SlaveError
-from protocol.signals import FloatArray
 from protocol.slave import Slave
-from protocol.variables import StartValue
+from slave_node.wrapped_slave import WrappedSlave
 
 
-class StatelessSlave(Slave):
+class StatelessSlave(WrappedSlave):
     """Hands on all calls but those to saved states.
 
     Args:
@@ -23,74 +20,10 @@ class StatelessSlave(Slave):
     """
 
     def __init__(self, slave: Slave, reason: str) -> None:
-        self._slave = slave
+        super().__init__(slave)
         self.description = replace(
             slave.description, state_kind=StateKind.NONE, state_reason=reason
         )
-
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
-        """See `Slave`."""
-        self._slave.initialize(
-            start_time=start_time,
-            stop_time=stop_time,
-            relative_tolerance=relative_tolerance,
-            start_values=start_values,
-            inputs=inputs,
-            outputs=outputs,
-            discrete_inputs=discrete_inputs,
-            discrete_outputs=discrete_outputs,
-            early_return=early_return,
-        )
-
-    def exit_initialization_mode(self) -> None:
-        """See `Slave`."""
-        self._slave.exit_initialization_mode()
-
-    def set_inputs(self, derivatives: FloatArray) -> None:
-        """See `Slave`."""
-        self._slave.set_inputs(derivatives)
-
-    def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
-        """See `Slave`."""
-        self._slave.set_discrete_inputs(values)
-
-    def do_step(
-        self, communication_point: float, step_size: float, no_set_state_prior: bool
-    ) -> StepResult:
-        """See `Slave`."""
-        return self._slave.do_step(communication_point, step_size, no_set_state_prior)
-
-    def get_outputs(self, order: int) -> FloatArray:
-        """See `Slave`."""
-        return self._slave.get_outputs(order)
-
-    def set_values(self, values: Mapping[str, StartValue]) -> None:
-        """See `Slave`."""
-        self._slave.set_values(values)
-
-    def get_discrete_outputs(self) -> tuple[StartValue, ...]:
-        """See `Slave`."""
-        return self._slave.get_discrete_outputs()
-
-    def record(self, names: Sequence[str]) -> None:
-        """See `Slave`."""
-        self._slave.record(names)
-
-    def get_recorded_variables(self) -> RecordedValues:
-        """See `Slave`."""
-        return self._slave.get_recorded_variables()
 
     def _refuse(self) -> NoReturn:
         raise SlaveError(
@@ -116,15 +49,3 @@ class StatelessSlave(Slave):
     def deserialize_state(self, data: bytes) -> object:  # noqa: ARG002
         """See `get_state`."""
         self._refuse()
-
-    def terminate(self) -> None:
-        """See `Slave`."""
-        self._slave.terminate()
-
-    def reset(self) -> None:
-        """See `Slave`."""
-        self._slave.reset()
-
-    def close(self) -> None:
-        """See `Slave`."""
-        self._slave.close()

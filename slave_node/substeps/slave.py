@@ -8,21 +8,21 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from protocol.calls import Configure, RecordedValues, StepResult, StepStatus
+from protocol.calls import Configure, Initialize, StepResult, StepStatus
 from protocol.description import InputDerivatives, SlaveDescription
 from protocol.errors import SlaveError
 from protocol.signals import MAX_ORDER, FloatArray, InputSignal
 from protocol.slave import Slave
 from protocol.step_sums import step_to
-from protocol.variables import Causality, StartValue
+from protocol.variables import Causality
 from slave_node.substeps.inputs import scaled, substep_values, substeps_needed
 from slave_node.substeps.polynomials import piece_polynomials, pieces_needed
+from slave_node.wrapped_slave import WrappedSlave
 
 DEFAULT = Configure()
 
@@ -96,7 +96,7 @@ def _lengths(number: int, *, meets_end: bool) -> tuple[float, ...]:
     return (*((1.0 - last) / number,) * number, last)
 
 
-class SubstepSlave(Slave):
+class SubstepSlave(WrappedSlave):
     """A slave whose communication steps are substeps of another one.
 
     With emulated input derivatives each substep has constant inputs, see ``inputs.py``, or
@@ -128,10 +128,8 @@ class SubstepSlave(Slave):
         *,
         degree: int = 0,
     ) -> None:
-        self._slave = slave
-        self.description: SlaveDescription = replace(
-            slave.description, input_derivatives=input_derivatives
-        )
+        super().__init__(slave)
+        self.description = replace(slave.description, input_derivatives=input_derivatives)
         self._derivatives = input_derivatives
         self._number = number
         self._degree = degree
@@ -147,61 +145,26 @@ class SubstepSlave(Slave):
         self._inputs = InputSignal(np.zeros((1, len(self._nominal))))
         self._standing = math.nan
 
-    # ---- Set up and tear down -----------------------------------------------------------------
+    # ---- Set up and inputs --------------------------------------------------------------------
 
-    def initialize(
-        self,
-        *,
-        start_time: float,
-        stop_time: float | None,
-        relative_tolerance: float | None,
-        start_values: Mapping[str, StartValue],
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        discrete_inputs: Sequence[str] = (),
-        discrete_outputs: Sequence[str] = (),
-        early_return: bool = False,
-    ) -> None:
-        """See `Slave`. ``relative_tolerance`` is also that of emulated inputs."""
-        self._slave.initialize(
-            start_time=start_time,
-            stop_time=stop_time,
-            relative_tolerance=relative_tolerance,
-            start_values=start_values,
-            inputs=inputs,
-            outputs=outputs,
-            discrete_inputs=discrete_inputs,
-            discrete_outputs=discrete_outputs,
-            early_return=early_return,
-        )
+    def initialize(self, experiment: Initialize) -> None:
+        """See `Slave`. Its relative tolerance is also that of emulated inputs."""
+        self._slave.initialize(experiment)
         description = self.description
+        inputs = experiment.inputs
         self._nominal = np.array([description.variable(name).nominal for name in inputs], float)
-        self._tolerance = relative_tolerance or _DEFAULT_TOLERANCE
+        self._tolerance = experiment.relative_tolerance or _DEFAULT_TOLERANCE
         depends = any(
             not set(description.feed_through.get(output, ())).isdisjoint(inputs)
-            for output in outputs
+            for output in experiment.outputs
         )
         self._meets_end = depends or description.capabilities.max_output_derivative_order > 0
         self._forget()
-
-    def exit_initialization_mode(self) -> None:
-        """See `Slave`."""
-        self._slave.exit_initialization_mode()
-
-    def terminate(self) -> None:
-        """See `Slave`."""
-        self._slave.terminate()
 
     def reset(self) -> None:
         """See `Slave`."""
         self._slave.reset()
         self._forget()
-
-    def close(self) -> None:
-        """See `Slave`."""
-        self._slave.close()
-
-    # ---- Values -------------------------------------------------------------------------------
 
     def set_inputs(self, derivatives: FloatArray) -> None:
         """See `Slave`.
@@ -216,30 +179,6 @@ class SubstepSlave(Slave):
         else:
             self._slave.set_inputs(derivatives[: 1 + self._degree])
         self._inputs = InputSignal(derivatives)
-
-    def get_outputs(self, order: int) -> FloatArray:
-        """See `Slave`."""
-        return self._slave.get_outputs(order)
-
-    def set_discrete_inputs(self, values: Sequence[StartValue]) -> None:
-        """See `Slave`."""
-        self._slave.set_discrete_inputs(values)
-
-    def set_values(self, values: Mapping[str, StartValue]) -> None:
-        """See `Slave`."""
-        self._slave.set_values(values)
-
-    def get_discrete_outputs(self) -> tuple[StartValue, ...]:
-        """See `Slave`."""
-        return self._slave.get_discrete_outputs()
-
-    def record(self, names: Sequence[str]) -> None:
-        """See `Slave`."""
-        self._slave.record(names)
-
-    def get_recorded_variables(self) -> RecordedValues:
-        """See `Slave`."""
-        return self._slave.get_recorded_variables()
 
     # ---- Step ---------------------------------------------------------------------------------
 
