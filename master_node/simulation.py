@@ -17,7 +17,7 @@ from master_node.hosts.agent_models import Uploading
 from master_node.hosts.model_hashes import check_hashes
 from master_node.hosts.opening import Slaves, slaves_in_process, slaves_on_bus
 from master_node.inputs.loading import load_signals
-from master_node.observing.observers import Observer, Observers
+from master_node.observing.observers import Observer, Observers, Outcome
 from master_node.preparing.configuring import configure
 from master_node.preparing.examinations import as_plain_data
 from master_node.preparing.preparation import prepare
@@ -186,6 +186,8 @@ def resume(
         observers: are told of everything that happens from there on.
         trust: run what the checkpoint names, whoever has written it.
 
+    A run that is complete is left as it is, and that is said.
+
     Raises:
         ResultsError: there is nothing to go on with, a file cannot be read, or another run writes
             there.
@@ -200,10 +202,11 @@ def resume(
             log.info("the run had got to its end: its results are complete now")
             store.remove()
             return
-        saved, checkpoint = store.load()
-        if is_complete(directory):  # its master was killed just then
-            store.remove()
+        if is_complete(directory):
+            log.info("the run in %s is complete: there is nothing to go on with", directory)
+            store.remove()  # its master may have been killed just then
             return
+        saved, checkpoint = store.load()
         if checkpoint is None:
             log.info("the run was broken off before its first checkpoint: it begins anew")
             resumption = Resumption(saved, CheckpointStore(directory, saved), None)
@@ -242,7 +245,7 @@ def _run(
     uploading: Uploading | None = None,
     trace: Path | None = None,
 ) -> None:
-    moment = f"before the {'first' if resumption is None else 'next'} step"
+    co_simulation: CoSimulation | None = None
     try:
         with _opened(
             system,
@@ -255,9 +258,33 @@ def _run(
             trace=trace,
         ) as co_simulation:
             co_simulation.run()
-            moment = "after the last step; the results are complete"
-    except KeyboardInterrupt:
-        raise InterruptedRunError(f"interrupted {moment}") from None
+    except (KeyboardInterrupt, InterruptedRunError) as error:
+        if co_simulation is None or not co_simulation.has_begun:
+            step = "first" if resumption is None else "next"
+            raise InterruptedRunError(f"interrupted before the {step} step") from None
+        raise _interruption(error, co_simulation, directory) from None
+
+
+def _interruption(
+    error: BaseException, co_simulation: CoSimulation, directory: Path | None
+) -> InterruptedRunError:
+    """Error of a run that was interrupted behind its beginning, with what became of it."""
+    end = co_simulation.end
+    if end is not None and end.outcome.is_complete:
+        if directory is None:
+            return InterruptedRunError("interrupted behind the end of the run")
+        if is_complete(directory):
+            return InterruptedRunError(
+                f"interrupted behind the end of the run; the results in {directory} are complete"
+            )
+    if isinstance(error, InterruptedRunError):
+        return error
+    remedy = co_simulation.checkpoints.remedy
+    if end is not None and end.outcome is Outcome.FAILED:
+        return InterruptedRunError(
+            f"interrupted behind the end of the run, which had failed: {end.message}", remedy=remedy
+        )
+    return InterruptedRunError("interrupted while the results were completed", remedy=remedy)
 
 
 @contextmanager

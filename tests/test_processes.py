@@ -593,7 +593,7 @@ def test_ctrl_c_and_sigterm(
         simulation=FOREVER,
         chassis_parameters={"sleeps_at": 0.02, "nap": 60.0, "bed": str(asleep)} if sleepy else {},
     )
-    options = ["--in-process"] if where == "in process" else []
+    options = ["--no-plot", *(["--in-process"] if where == "in process" else [])]
     master = start("master_node", "run", file, "--output", tmp_path / "out", *options)
     master.wait_for("simulating")
     if sleepy:

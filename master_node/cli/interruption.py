@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import time
 
 from protocol.errors import InterruptedRunError
+from protocol.host.processes import interrupt_main_thread
 from protocol.host.threads import start_thread
 
 _END_TIME = 5.0
@@ -19,7 +19,7 @@ def end_with_parent() -> None:
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 4096):
             pass
-        os.kill(os.getpid(), signal.SIGINT)
+        interrupt_main_thread()
         time.sleep(_END_TIME)
         os._exit(InterruptedRunError.exit_code)  # a model in this process does not come back
 

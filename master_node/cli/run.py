@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,8 +22,8 @@ from master_node.cli.options import (
     Tls,
 )
 from protocol.bus.endpoints import LOOPBACK
-from protocol.errors import ConfigurationError
-from protocol.host.interruption import interruptible
+from protocol.errors import ConfigurationError, InterruptedRunError, ResultsError
+from protocol.host.interruption import Interruption, interruptible
 from protocol.host.logs import LogFormat, configure_logs
 from protocol.host.standard_output import output_of_others
 from protocol.host.terminal import say
@@ -31,6 +31,7 @@ from protocol.host.toml_text import assigned_values
 
 if TYPE_CHECKING:  # each command imports what it needs
     from master_node.observing.observers import Observer
+    from master_node.results import Result
 
 log = logging.getLogger("master_node")
 
@@ -139,7 +140,7 @@ def run(  # noqa: PLR0917  options of the command line
 ) -> None:
     """Run SYSTEM and write results, by default results.csv, steps, summary and a picture."""
     configure_logs(log_format, TEXT_FORMAT)
-    with interruptible(), ExitStack() as stack:
+    with interruptible() as interruption, ExitStack() as stack:
         if stay_with_parent:
             end_with_parent()
         if in_process:
@@ -202,7 +203,8 @@ def run(  # noqa: PLR0917  options of the command line
         if metrics_port is not None:
             observers.append(_served_metrics(stack, metrics_port, metrics_host))
         uploading = stack.enter_context(UploadBar(quiet=quiet))
-        with output_of_others():
+        draws = not (no_plot or stay_with_parent)
+        with _drawn_when_interrupted(output, interruption, observers, draws=draws):
             run_system(
                 system,
                 output,
@@ -224,20 +226,69 @@ def _refuse_beside_in_process(options: Mapping[str, object]) -> None:
         )
 
 
+class _Beginning:
+    """An observer that knows if a run has begun, so that results are its own."""
+
+    def __init__(self) -> None:
+        self.is_over = False
+
+    def started(self, _: object) -> None:
+        """It has."""
+        self.is_over = True
+
+    def attempted(self, _: object) -> None:
+        """Nothing."""
+
+    def ended(self, _: object) -> None:
+        """Nothing."""
+
+
+@contextmanager
+def _drawn_when_interrupted(
+    directory: Path, interruption: Interruption, observers: list[Observer], *, draws: bool
+) -> Iterator[None]:
+    """Draw the results of a run that Ctrl-C breaks off; another Ctrl-C leaves the picture out."""
+    beginning = _Beginning()
+    observers.append(beginning)
+    try:
+        with output_of_others():
+            yield
+    except InterruptedRunError:
+        if draws and beginning.is_over and interruption.is_ctrl_c:
+            try:
+                from master_node.results import Result
+
+                _draw(Result.load(directory), directory)
+            except ResultsError as error:
+                log.warning("%s", error)
+        raise
+
+
 def _show(directory: Path, *, quiet: bool, no_plot: bool) -> None:
     """Picture and summary of a run that has ended."""
     from master_node.observing.progress import summary_table
-    from master_node.results import PLOT_FILE, Result
+    from master_node.results import Result
     from protocol.host.tables import show
 
     result = Result.load(directory)
     if not no_plot:
-        from master_node.results.plots import plot_result
-
-        plot_result(result, directory / PLOT_FILE, show=False, variables=None, is_named=False)
+        try:
+            _draw(result, directory)
+        except KeyboardInterrupt:
+            raise InterruptedRunError(
+                "interrupted while the picture was drawn; the results are complete",
+                remedy=f"`master-node plot {directory}` draws it",
+            ) from None
     if not quiet:
         show(summary_table(result.summary))
         say(f"results in {directory}")
+
+
+def _draw(result: Result, directory: Path) -> None:
+    from master_node.results import PLOT_FILE
+    from master_node.results.plots import plot_result
+
+    plot_result(result, directory / PLOT_FILE, show=False, variables=None, is_named=False)
 
 
 def resume(
@@ -252,12 +303,13 @@ def resume(
 
     It runs the models and functions that the checkpoint in DIRECTORY names.
     """
-    with interruptible():
+    with interruptible() as interruption:
         from master_node.observing.progress import ProgressBar
         from master_node.simulation import resume as resume_run
 
-        with output_of_others():
-            resume_run(directory, observers=(ProgressBar(quiet=quiet),), trust=trust)
+        observers: list[Observer] = [ProgressBar(quiet=quiet)]
+        with _drawn_when_interrupted(directory, interruption, observers, draws=not no_plot):
+            resume_run(directory, observers=observers, trust=trust)
         _show(directory, quiet=quiet, no_plot=no_plot)
 
 

@@ -269,11 +269,11 @@ class Observers:
 
     def ended(self, end: RunEnd) -> None:
         """Pass on to all; the first error is raised after everyone was told."""
-        errors = []
+        errors: list[BaseException] = []
         for observer in self._observers:
             try:
                 observer.ended(end)
-            except Exception as error:  # every observer must get to close its files
+            except (Exception, KeyboardInterrupt) as error:  # each must get to close its files
                 errors.append(error)
         if errors:
             raise errors[0]

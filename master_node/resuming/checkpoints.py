@@ -266,6 +266,11 @@ class Checkpoints:
         if self._files is not None:
             self._files.cut(position)
 
+    @property
+    def remedy(self) -> str:
+        """Remedy for a run that was broken off; "" without a store."""
+        return "" if self._store is None else self._store.remedy
+
     def broken_off(self) -> None:
         """The run did not get to its end: it can be resumed from where it stood last."""
         if self._store is None or self._place is None:

@@ -123,6 +123,11 @@ class CheckpointStore:
         """All that says what is run and where it stood."""
         return self._folder, self._folder / _SYSTEM_FILE, self._folder / _RUN_FILE
 
+    @property
+    def remedy(self) -> str:
+        """Remedy for a run that was broken off."""
+        return f"`master-node resume {self.directory}` goes on from there"
+
     def begin(self) -> None:
         """Replace the checkpoint of an earlier run.
 

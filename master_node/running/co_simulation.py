@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
@@ -196,6 +196,10 @@ class CoSimulation:
             still to be initialized.
         checkpoints: are told where the run stands.
         resumed: where to go on, with slaves that can be restored; None: at T_0.
+
+    Attributes:
+        has_begun: True when the observer was told of the beginning.
+        end: what the observer is told at the end; None: it is not there yet.
     """
 
     group: SlaveGroup
@@ -205,6 +209,8 @@ class CoSimulation:
     outputs: Outputs | None = None
     checkpoints: Checkpoints = NO_CHECKPOINTS
     resumed: Resumed | None = None
+    has_begun: bool = field(default=False, init=False)
+    end: RunEnd | None = field(default=None, init=False)
 
     def run(self) -> Statistics:
         """Initialize, step to the stop time, terminate.
@@ -239,6 +245,7 @@ class CoSimulation:
             self.group.continue_statistics(self.resumed.statistics)
             statistics = replace(self.resumed.statistics, slaves=self.group.statistics)
         self.observer.started(self._start(outputs))
+        self.has_begun = True
         begin = perf_counter() - statistics.wall_time
 
         def update() -> None:
@@ -249,6 +256,7 @@ class CoSimulation:
                 statistics.slaves[slave].restarts = restarts
 
         outcome, message = Outcome.FAILED, ""
+        run: Run | None = None
         try:
             self.checkpoints.begin(statistics, update)
             try:
@@ -257,22 +265,39 @@ class CoSimulation:
             finally:
                 update()
                 self.group.restart_statistics()
-            failure = self._terminate(statistics.time)
+            refusal = self._terminate(statistics.time)
             outcome, note = run.outcome
-            message = "; ".join(filter(None, (note, failure)))
+            message = "; ".join(filter(None, (note, refusal)))
         except KeyboardInterrupt:
-            outcome, message = Outcome.INTERRUPTED, f"interrupted at t={statistics.time!r} s"
-            raise InterruptedRunError(message) from None
-        except BaseException as error:
-            message = str(error)
+            outcome, message, error = self._interrupted(run, statistics.time)
+            raise error from None
+        except BaseException as failure:
+            message = str(failure)
             raise
         finally:
             if not outcome.is_complete:
                 self.checkpoints.broken_off()
             for warning in warnings_of(statistics):
                 log.warning("%s", warning)
-            self.observer.ended(RunEnd(outcome, statistics, message))
-        if outcome.is_complete:
+            self._tell_end(RunEnd(outcome, statistics, message))
+
+    def _interrupted(
+        self, run: Run | None, time: float
+    ) -> tuple[Outcome, str, InterruptedRunError]:
+        """Outcome, message and error where Ctrl-C came at ``time`` [s].
+
+        A run that has taken its last step is complete: nothing of its results is missing.
+        """
+        if run is not None and run.ended is not None:
+            return *run.outcome, InterruptedRunError("interrupted behind the last step")
+        message = f"interrupted at t={time!r} s"
+        error = InterruptedRunError(message, remedy=self.checkpoints.remedy)
+        return Outcome.INTERRUPTED, message, error
+
+    def _tell_end(self, end: RunEnd) -> None:
+        self.end = end
+        self.observer.ended(end)
+        if end.outcome.is_complete:
             self.checkpoints.remove()
 
     def _start(self, outputs: Outputs) -> RunStart:

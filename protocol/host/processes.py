@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
+import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,12 +14,31 @@ _DEAD_STATES = frozenset("ZX")  # a zombie only waits for its parent to look
 
 
 def ending_signals() -> list[signal.Signals]:
-    """Those that ask a command to end; SIGHUP, of a terminal that is gone, not under ``nohup``."""
+    """Those that ask a command to end; SIGHUP, of a terminal that is gone, not under ``nohup``.
+
+    SIGBREAK is that of Ctrl-Break, and of a window that is closed, on Windows.
+    """
     numbers = [signal.SIGINT, signal.SIGTERM]
+    if sys.platform == "win32":
+        numbers.append(signal.SIGBREAK)
     hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
     if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
         numbers.append(hang_up)
     return numbers
+
+
+def interrupt_main_thread() -> None:
+    """Send SIGINT to the main thread, from any thread; what it waits for is broken off.
+
+    ``os.kill`` would end the process on Windows, and ``raise_signal`` would not wake the main
+    thread elsewhere.
+    """
+    if sys.platform == "win32":
+        signal.raise_signal(signal.SIGINT)
+    else:
+        main = threading.main_thread().ident
+        assert main is not None
+        signal.pthread_kill(main, signal.SIGINT)
 
 
 class PeerProcess:
