@@ -10,17 +10,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from master_node.coupling.coupled_system import resolve
 from master_node.coupling.external import Signals
-from master_node.coupling.step_sizes import check_step_sizes, with_bounded_steps, with_fixed_steps
+from master_node.coupling.step_sizes import check_step_sizes
 from master_node.hosts.agent_models import Uploading
 from master_node.hosts.model_hashes import check_hashes
-from master_node.hosts.opening import Slaves, slaves_in_process, slaves_on_bus
+from master_node.hosts.opening import Slaves, opened_slaves
 from master_node.inputs.loading import load_signals
 from master_node.observing.observers import Observer, Observers, Outcome
-from master_node.preparing.configuring import configure
 from master_node.preparing.examinations import as_plain_data
-from master_node.preparing.preparation import prepare
+from master_node.preparing.readiness import make_ready
 from master_node.results import (
     Recording,
     Result,
@@ -44,17 +42,15 @@ from master_node.resuming.saved_system import (
     reopened,
     saved_system,
 )
-from master_node.running.co_simulation import CoSimulation, check_capabilities
+from master_node.running.co_simulation import CoSimulation
 from master_node.running.session import Session
-from master_node.slaves.group import SlaveGroup
 from master_node.slaves.restorable import RestorableSlave
-from master_node.slaves.shared_process import Baseline, SharedProcess, shared_process
+from master_node.slaves.shared_process import SharedProcess, shared_process
 from master_node.system.summary import settings_of
 from master_node.system.system import System
 from master_node.system.trust import check_own
 from protocol.errors import InterruptedRunError
 from protocol.host.new_files import own_folder
-from protocol.host.scratch import ScratchDirectory
 from protocol.text.names import some
 
 log = logging.getLogger("master_node")
@@ -309,7 +305,16 @@ def _opened(
             if resumption is None:
                 stack.enter_context(exclusive(directory))
         traces = [] if trace is None else [stack.enter_context(closing(TraceWriter(trace)))]
-        slaves = stack.enter_context(_slaves(system, directory, mode, uploading, baseline))
+        slaves = stack.enter_context(
+            opened_slaves(
+                system,
+                None if directory is None or mode.in_process else _logs(directory),
+                in_process=mode.in_process,
+                launch=mode.launch,
+                uploading=uploading,
+                baseline=baseline,
+            )
+        )
         yield _co_simulation(
             system, signals, directory, mode, observers, slaves, traces, recording, resumption
         )
@@ -332,21 +337,8 @@ def _co_simulation(  # noqa: PLR0917  what a run is made of
     check_hashes(system, slaves.descriptions)
     restorable = _restorable(slaves, system, directory)
     links = {**slaves.links, **{slave.name: slave for slave in restorable}}
-    given = system
-    descriptions = configure(links, system, slaves.descriptions)
-    system = with_fixed_steps(system, descriptions)
-    coupled = resolve(system, descriptions, signals)
-    system = with_bounded_steps(system, coupled)
-    check_step_sizes(system)
-    warnings = check_capabilities(coupled, system)
-    for warning in warnings:
-        log.warning("%s", warning)
-    group = SlaveGroup(links, traces)
-    prepared = prepare(group, system, descriptions, signals)
-    coupled = resolve(prepared.system, prepared.descriptions, signals)
-    for warning in check_capabilities(coupled, prepared.system):
-        if warning not in warnings:
-            log.warning("%s", warning)
+    ready = make_ready(links, system, slaves.descriptions, signals, traces)
+    group, coupled, prepared = ready.group, ready.coupled, ready.prepared
     wanted = system.results
     recorded = (*coupled.recorded.continuous, *coupled.recorded.discrete)
     check_variables(
@@ -359,8 +351,8 @@ def _co_simulation(  # noqa: PLR0917  what a run is made of
     store = None
     if resumption is not None:
         store = resumption.store
-    elif directory is not None and _writes_checkpoints(given):
-        store = CheckpointStore(directory, saved_system(given, mode, slaves.descriptions))
+    elif directory is not None and _writes_checkpoints(system):
+        store = CheckpointStore(directory, saved_system(system, mode, slaves.descriptions))
     settings = settings_of(prepared.system, prepared.descriptions)
     settings["examinations"] = as_plain_data(prepared.examinations)
     keepers: list[Observer] = []
@@ -438,24 +430,6 @@ def _restorable(slaves: Slaves, system: System, directory: Path | None) -> list[
         RestorableSlave(name, link, slaves.descriptions[name], None)
         for name, link in slaves.links.items()
     ]
-
-
-@contextmanager
-def _slaves(
-    system: System,
-    directory: Path | None,
-    mode: RunMode,
-    uploading: Uploading | None,
-    baseline: Baseline,
-) -> Iterator[Slaves]:
-    if mode.in_process:
-        with slaves_in_process(system, baseline) as slaves:
-            yield slaves
-        return
-    with ScratchDirectory() as temporary:
-        logs = temporary if directory is None else _logs(directory)
-        with slaves_on_bus(system, logs, launch=mode.launch, uploading=uploading) as slaves:
-            yield slaves
 
 
 def _logs(directory: Path) -> Path:

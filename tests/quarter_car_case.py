@@ -24,9 +24,10 @@ from master_node.numerics.double_step_times import DoubleStepTimes
 from master_node.numerics.error_estimators import ESTIMATORS
 from master_node.numerics.extrapolation import CouplingHistory, InputPolynomial
 from master_node.observing.observers import Observer, Observers
+from master_node.preparing.capabilities import check_capabilities
 from master_node.preparing.initialization import initialize
 from master_node.results import Recording
-from master_node.running.co_simulation import CoSimulation, check_capabilities
+from master_node.running.co_simulation import CoSimulation
 from master_node.slaves.group import SlaveGroup
 from master_node.slaves.link import LocalSlave
 from master_node.stepping.double_step import DoubleStep, DoubleStepper

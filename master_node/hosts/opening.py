@@ -78,6 +78,36 @@ class Slaves:
 
 
 @contextmanager
+def opened_slaves(
+    system: System,
+    log_directory: Path | None,
+    *,
+    in_process: bool = False,
+    launch: bool = True,
+    uploading: Uploading | None = None,
+    baseline: Baseline | None = None,
+) -> Iterator[Slaves]:
+    """The slaves of a system, wherever they run; raises as the two ways below.
+
+    Args:
+        system: what to run.
+        log_directory: existing; gets the launched slaves' logs; None: these are not kept.
+        in_process: all slaves in this process; else over Zenoh.
+        launch: start slaves that have a model; False: find all of them on the bus.
+        uploading: told of models that are sent to agents.
+        baseline: see `slaves_in_process`.
+    """
+    if in_process:
+        with slaves_in_process(system, baseline) as slaves:
+            yield slaves
+        return
+    with ScratchDirectory() as temporary:
+        logs = temporary if log_directory is None else log_directory
+        with slaves_on_bus(system, logs, launch=launch, uploading=uploading) as slaves:
+            yield slaves
+
+
+@contextmanager
 def slaves_in_process(system: System, baseline: Baseline | None = None) -> Iterator[Slaves]:
     """All slaves in this process, without a bus.
 
