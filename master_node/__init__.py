@@ -6,6 +6,8 @@ from importlib import import_module
 
 TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than all else here
 if TYPE_CHECKING:
+    from master_node.checking.checking import check_system
+    from master_node.checking.report import SystemReport
     from master_node.results import Result
     from master_node.running.session import Session
     from master_node.simulation import open_run, resume, simulate
@@ -30,6 +32,8 @@ __all__ = [
     "SimulationSettings",
     "SlaveSettings",
     "System",
+    "SystemReport",
+    "check_system",
     "load_system",
     "open_run",
     "open_system",
@@ -42,6 +46,8 @@ _ELSEWHERE = {
     "Session": "running.session",
     "SimulationSettings": "system.simulation",
     "System": "system.system",
+    "SystemReport": "checking.report",
+    "check_system": "checking.checking",
     "load_system": "system.system",
     "open_run": "simulation",
     "open_system": "system.files",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from master_node.cli.bus import doctor, list_
+from master_node.cli.check import check
 from master_node.cli.options import TEXT_FORMAT
 from master_node.cli.packages import export, import_
 from master_node.cli.results import compare, plot
@@ -22,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for command in (run, resume, sweep, plot, compare):
+for command in (run, check, resume, sweep, plot, compare):
     app.command()(command)
 app.command("import")(import_)
 app.command()(export)

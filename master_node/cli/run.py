@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,16 +13,27 @@ import typer
 from master_node.cli.interruption import end_with_parent
 from master_node.cli.options import (
     TEXT_FORMAT,
+    InProcess,
     Insecure,
     LogStyle,
     MetricsHost,
     MetricsPort,
+    NoExamine,
+    NoLaunch,
     PackageBus,
+    Parameter,
     ResultDirectory,
+    RunConnect,
+    RunListen,
+    RunMode,
+    State,
+    SystemFile,
+    Timeout,
     Tls,
+    refuse_beside_in_process,
 )
 from protocol.bus.endpoints import LOOPBACK
-from protocol.errors import ConfigurationError, InterruptedRunError, ResultsError
+from protocol.errors import InterruptedRunError, ResultsError
 from protocol.host.interruption import Interruption, interruptible
 from protocol.host.logs import LogFormat, configure_logs
 from protocol.host.standard_output import output_of_others
@@ -37,12 +48,7 @@ log = logging.getLogger("master_node")
 
 
 def run(  # noqa: PLR0917  options of the command line
-    system_file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SYSTEM", help="A .toml, .ssp or .ssd file, or PACKAGE.ssp#VARIANT.ssd."
-        ),
-    ],
+    system_file: SystemFile,
     output: Annotated[Path, typer.Option(help="Directory for the results.")] = Path("results"),
     preset: Annotated[
         str | None, typer.Option(help="paper: the method as Schierz, Arnold and Clauß have it.")
@@ -94,40 +100,21 @@ def run(  # noqa: PLR0917  options of the command line
     case: Annotated[
         Path | None, typer.Option(help="Parameters of a run of a study, its case.toml.")
     ] = None,
-    parameter: Annotated[
-        list[str] | None, typer.Option(help="Start value, slave.variable=value; may be repeated.")
-    ] = None,
-    state: Annotated[
-        str | None,
-        typer.Option(help="How all slaves save their states: native, fork, replay or none."),
-    ] = None,
-    in_process: Annotated[
-        bool, typer.Option("--in-process", help="Run the slaves in this process, without a bus.")
-    ] = False,
-    no_launch: Annotated[
-        bool, typer.Option("--no-launch", help="Start no slaves: find all of them on the bus.")
-    ] = False,
-    connect: Annotated[
-        list[str] | None, typer.Option(help="Slave to connect to, tcp/HOST:PORT.")
-    ] = None,
-    listen: Annotated[
-        list[str] | None, typer.Option(help="Address to which slaves can connect, tcp/HOST:PORT.")
-    ] = None,
+    parameter: Parameter = None,
+    state: State = None,
+    in_process: InProcess = False,
+    no_launch: NoLaunch = False,
+    connect: RunConnect = None,
+    listen: RunListen = None,
     insecure: Insecure = False,
     tls: Tls = None,
-    mode: Annotated[
-        str | None, typer.Option(help="peer: reach slaves directly; client: through a router.")
-    ] = None,
+    mode: RunMode = None,
     package_bus: PackageBus = False,
-    timeout: Annotated[
-        float | None, typer.Option(help="Bound on the wait for slaves to appear [s].")
-    ] = None,
+    timeout: Timeout = None,
     pin: Annotated[
         bool, typer.Option("--pin", help="Keep each launched slave on one processor.")
     ] = False,
-    no_examine: Annotated[
-        bool, typer.Option("--no-examine", help="Let the slaves take no trial steps first.")
-    ] = False,
+    no_examine: NoExamine = False,
     trace: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Trace of all requests, for Perfetto.")
     ] = None,
@@ -144,7 +131,7 @@ def run(  # noqa: PLR0917  options of the command line
         if stay_with_parent:
             end_with_parent()
         if in_process:
-            _refuse_beside_in_process(
+            refuse_beside_in_process(
                 {
                     "--no-launch": no_launch,
                     "--connect": connect,
@@ -215,15 +202,6 @@ def run(  # noqa: PLR0917  options of the command line
                 trace=trace,
             )
         _show(output, quiet=quiet, no_plot=no_plot)
-
-
-def _refuse_beside_in_process(options: Mapping[str, object]) -> None:
-    given = [name for name, value in options.items() if value]
-    if given:
-        raise ConfigurationError(
-            f"{given[0]} is for slaves on the bus, and with --in-process there is none",
-            remedy=f"leave out {given[0]} or --in-process",
-        )
 
 
 class _Beginning:

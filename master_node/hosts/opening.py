@@ -5,9 +5,10 @@ Each way is a context manager that gives a `Slaves` and leaves nothing running b
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -55,12 +56,14 @@ class Slaves:
         descriptions: what each said of itself.
         starters: of those that were started for this run.
         restarts: starts them again, None in process and without recovery.
+        hosts: on which they run, by name.
     """
 
     links: Mapping[str, SlaveLink]
     descriptions: Mapping[str, SlaveDescription]
     starters: Sequence[Starter] = ()
     restarts: Restarts | None = None
+    hosts: Mapping[str, str] = field(default_factory=dict)
 
     def explain(self, error: DoublestepError) -> DoublestepError:
         """A lost slave's error with the exit code and last words of its process, if it is ours."""
@@ -138,7 +141,7 @@ def slaves_in_process(system: System, baseline: Baseline | None = None) -> Itera
             stack.callback(process.run, executor.close)
             links[name] = LocalSlave(executor, process)
             descriptions[name] = executor.description
-        yield Slaves(links, descriptions)
+        yield Slaves(links, descriptions, hosts=dict.fromkeys(links, socket.gethostname()))
 
 
 @contextmanager
@@ -235,7 +238,13 @@ def slaves_on_bus(
             return launcher.launch(name, model, system.base), launcher
 
         restarts = Restarts(system, remotes, claim, start_again, presence, frozenset(started))
-        slaves = Slaves(dict(remotes), describe(remotes), starters, restarts if recovers else None)
+        slaves = Slaves(
+            dict(remotes),
+            describe(remotes),
+            starters,
+            restarts if recovers else None,
+            {name: remote.host for name, remote in remotes.items()},
+        )
         agents.verify(slaves.descriptions)
         try:
             yield slaves

@@ -62,7 +62,7 @@ def initialize(
     may_return_early = simulation.estimator != "none" and step_size_limits(system).quantum is None
     group.execute_all(
         [
-            (_initialize(part, names, system, may_return_early),)
+            (initialize_call(part, names, system, may_return_early=may_return_early),)
             for part, names in zip(coupled.parts, coupled.recorded.names, strict=True)
         ],
         start,
@@ -82,8 +82,12 @@ def initialize(
     return outputs
 
 
-def _initialize(
-    part: SlavePart, recorded: tuple[str, ...], system: System, may_return_early: bool
+def initialize_call(
+    part: SlavePart,
+    recorded: tuple[str, ...],
+    system: System,
+    *,
+    may_return_early: bool = False,
 ) -> Initialize:
     """Call that initializes a slave, which returns early at events only if it can go back."""
     simulation = system.simulation

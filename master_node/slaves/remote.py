@@ -55,6 +55,9 @@ class RemoteSlave:
             The slave is told to wait longer than that for its master.
         clock: for its waits.
 
+    Attributes:
+        host: of its process.
+
     Raises:
         SlaveBusyError: another run holds the slave.
         SlaveLostError, DeadlineError: it does not answer.
@@ -100,6 +103,7 @@ class RemoteSlave:
         self._epoch, self._claim_name = claimed.epoch, claim_name(claimed.epoch)
         self._sequence = 0
         self._process = PeerProcess(claimed.host, claimed.pid)
+        self.host = claimed.host
 
     def _caller(self) -> Caller:
         """The caller for requests with the bound of the present one; it may be cancelled."""

@@ -29,3 +29,8 @@ def some(names: Iterable[str], most: int = 20) -> str:
     all_names = list(names)
     more = f" and {len(all_names) - most} more" if len(all_names) > most else ""
     return ", ".join(all_names[:most]) + more
+
+
+def number_of(count: int, noun: str) -> str:
+    """``1 input``, ``2 inputs``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
