@@ -276,6 +276,19 @@ def master_run(world: World) -> str:
     return world.run("master-node", "run", world.hostile_package(), "--in-process", "--no-plot")
 
 
+def master_check(world: World) -> str:
+    """What an FMU says of itself, in the report, as data and in the graph; a model that fails."""
+    text = '[simulation]\nstop_time = 1.0\nexamine = false\n[slaves.wheel]\nmodel = "evil.fmu"\n'
+    world.hostile_fmu()
+    file = world.write("evil.toml", text)
+    check(world.run("master-node", "check", file, "--in-process", "--graph", "graph.mmd"), *SHOWN)
+    said = world.run("master-node", "check", file, "--json")
+    assert json.loads(said)["slaves"][0]["name"] == "wheel"
+    lines = (world.folder / "graph.mmd").read_text(encoding="utf-8").splitlines()
+    assert lines[0] == "flowchart LR"
+    return world.run("master-node", "check", world.hostile_system(0.0), "--in-process")
+
+
 def master_resume(world: World) -> str:
     """The run fails again where it failed before."""
     file = world.hostile_system(0.5)
@@ -390,6 +403,7 @@ def slave_certificates(world: World) -> str:
 
 SCENARIOS: dict[tuple[str, str], tuple[Callable[[World], str], tuple[str, ...]]] = {
     ("master-node", "run"): (master_run, SHOWN),
+    ("master-node", "check"): (master_check, SHOWN),
     ("master-node", "resume"): (master_resume, SHOWN),
     ("master-node", "sweep"): (master_sweep, SHOWN),
     ("master-node", "plot"): (master_plot, SHOWN),
