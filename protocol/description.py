@@ -121,6 +121,19 @@ class SlaveDescription:
         return tuple(v for v in self.variables if v.causality is causality)
 
 
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """DefaultExperiment of a model description; None where it says nothing.
+
+    Attributes:
+        start_time, stop_time, step_size: [s].
+    """
+
+    start_time: float | None = None
+    stop_time: float | None = None
+    step_size: float | None = None
+
+
 class StateVerdict(StrEnum):
     """Verdict of a test of saved states.
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 from protocol.calls import Configure
-from protocol.description import SlaveDescription
+from protocol.description import Experiment, SlaveDescription
 from protocol.slave import CallExecutor, Slave
 from slave_node.execution.executor import Executor
-from slave_node.models import DEFAULT, describe_alone, load_model
+from slave_node.models import DEFAULT, default_experiment, describe_alone, load_model
 from slave_node.states.ladder import choose, described, with_states
 
 
@@ -61,6 +61,11 @@ def describe_model(model: str, base: Path) -> SlaveDescription:
     """
     description = describe_alone(model, base)
     return described(description, choose(description))
+
+
+def experiment(model: str, base: Path) -> Experiment:
+    """Experiment that ``model`` suggests; raises as `describe_model`."""
+    return default_experiment(model, base)
 
 
 def load_executor(

@@ -6,11 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from protocol.calls import Configure
-from protocol.description import SlaveDescription
+from protocol.description import Experiment, SlaveDescription
 from protocol.errors import ModelError
 from protocol.host.files import is_fmu
+from protocol.host.scratch import ScratchDirectory
 from protocol.host.user_code import user_context
 from protocol.slave import Slave
+from protocol.text.references import split_reference
 from slave_node.model import Model, describe
 from slave_node.python.loading import load_model_class
 from slave_node.substeps.slave import input_derivatives, with_substeps
@@ -68,8 +70,23 @@ def describe_alone(model: str, base: Path) -> SlaveDescription:
     return replace(description, input_derivatives=input_derivatives(description))
 
 
+def default_experiment(model: str, base: Path) -> Experiment:
+    """Experiment that a model suggests; a Python model suggests none.
+
+    Raises:
+        ModelError: the model is missing or cannot be read.
+    """
+    if not is_fmu(model, base):
+        describe_alone(model, base)
+        return Experiment()
+    from slave_node.fmu.description import read_fmu  # noqa: PLC0415  as above
+
+    with ScratchDirectory() as directory:
+        return read_fmu((base / model).resolve(), directory).experiment
+
+
 def _model_class(model: str, base: Path) -> type[Model]:
-    if ":" not in model:
+    if split_reference(model) is None:
         raise ModelError(
             f"{model!r} is not a model",
             remedy="name an .fmu file, the folder of an FMU, package.module:Class or file.py:Class",

@@ -11,11 +11,19 @@ import typer
 from protocol.errors import ConfigurationError
 from protocol.host.logs import LogFormat
 
+METHOD, TIME, RESULTS = "Method", "Time and steps", "Results"
+MODELS, SLAVES, BUS, OBSERVATION = "Parameters", "Slaves", "Bus", "Observation"
+"""Sections of the help of commands that run systems."""
+
 TEXT_FORMAT = "%(levelname)s: %(message)s"
 
 Tls = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Certificates: encrypt, and accept only peers that have one."),
+    typer.Option(
+        metavar="DIR",
+        help="Certificates: encrypt, and accept only peers that have one.",
+        rich_help_panel=BUS,
+    ),
 ]
 Connect = Annotated[
     list[str] | None,
@@ -24,50 +32,91 @@ Connect = Annotated[
 Listen = Annotated[
     list[str] | None, typer.Option(help="Address to which slaves connect while no master runs.")
 ]
-Insecure = Annotated[bool, typer.Option("--insecure", help="Allow addresses other than loopback.")]
+Insecure = Annotated[
+    bool,
+    typer.Option("--insecure", help="Allow addresses other than loopback.", rich_help_panel=BUS),
+]
 MetricsPort = Annotated[
     int | None,
-    typer.Option(min=0, max=65535, help="Port of metrics for Prometheus."),
+    typer.Option(
+        min=0, max=65535, help="Port of metrics for Prometheus.", rich_help_panel=OBSERVATION
+    ),
 ]
-MetricsHost = Annotated[str, typer.Option(help="Address for metrics, without authentication.")]
+MetricsHost = Annotated[
+    str,
+    typer.Option(help="Address for metrics, without authentication.", rich_help_panel=OBSERVATION),
+]
 PackageBus = Annotated[
-    bool, typer.Option("--package-bus", help="Take [bus] from a package, addresses included.")
+    bool,
+    typer.Option(
+        "--package-bus", help="Take [bus] from a package, addresses included.", rich_help_panel=BUS
+    ),
 ]
 SystemFile = Annotated[
     Path,
     typer.Argument(
-        metavar="SYSTEM", help="A .toml, .ssp or .ssd file, or PACKAGE.ssp#VARIANT.ssd."
+        metavar="SYSTEM",
+        help="A .toml, .ssp or .ssd file, or PACKAGE.ssp#VARIANT.ssd; or one model: an .fmu file, "
+        "package.module:Class or path/to/file.py:Class.",
     ),
 ]
 Parameter = Annotated[
-    list[str] | None, typer.Option(help="Start value, slave.variable=value; may be repeated.")
+    list[str] | None,
+    typer.Option(
+        help="Start value, slave.variable=value; may be repeated.", rich_help_panel=MODELS
+    ),
 ]
 State = Annotated[
     str | None,
-    typer.Option(help="How all slaves save their states: native, fork, replay or none."),
+    typer.Option(
+        help="How all slaves save their states: native, fork, replay or none.",
+        rich_help_panel=SLAVES,
+    ),
 ]
 InProcess = Annotated[
-    bool, typer.Option("--in-process", help="Run the slaves in this process, without a bus.")
+    bool,
+    typer.Option(
+        "--in-process",
+        help="Run the slaves in this process, without a bus.",
+        rich_help_panel=SLAVES,
+    ),
 ]
 NoLaunch = Annotated[
-    bool, typer.Option("--no-launch", help="Start no slaves: find all of them on the bus.")
+    bool,
+    typer.Option(
+        "--no-launch", help="Start no slaves: find all of them on the bus.", rich_help_panel=SLAVES
+    ),
 ]
 NoExamine = Annotated[
-    bool, typer.Option("--no-examine", help="Let the slaves take no trial steps first.")
+    bool,
+    typer.Option(
+        "--no-examine", help="Let the slaves take no trial steps first.", rich_help_panel=SLAVES
+    ),
 ]
 RunConnect = Annotated[
-    list[str] | None, typer.Option("--connect", help="Slave to connect to, tcp/HOST:PORT.")
+    list[str] | None,
+    typer.Option("--connect", help="Slave to connect to, tcp/HOST:PORT.", rich_help_panel=BUS),
 ]
 RunListen = Annotated[
     list[str] | None,
-    typer.Option("--listen", help="Address to which slaves can connect, tcp/HOST:PORT."),
+    typer.Option(
+        "--listen", help="Address to which slaves can connect, tcp/HOST:PORT.", rich_help_panel=BUS
+    ),
 ]
 RunMode = Annotated[
     str | None,
-    typer.Option("--mode", help="peer: reach slaves directly; client: through a router."),
+    typer.Option(
+        "--mode", help="peer: reach slaves directly; client: through a router.", rich_help_panel=BUS
+    ),
 ]
-Timeout = Annotated[float | None, typer.Option(help="Bound on the wait for slaves to appear [s].")]
-LogStyle = Annotated[LogFormat, typer.Option(help="Format of messages on standard error.")]
+Timeout = Annotated[
+    float | None,
+    typer.Option(help="Bound on the wait for slaves to appear [s].", rich_help_panel=BUS),
+]
+LogStyle = Annotated[
+    LogFormat,
+    typer.Option(help="Format of messages on standard error.", rich_help_panel=OBSERVATION),
+]
 ResultDirectory = Annotated[Path, typer.Argument(help="A result directory.")]
 Results = Annotated[
     Path,

@@ -12,7 +12,13 @@ import typer
 
 from master_node.cli.interruption import end_with_parent
 from master_node.cli.options import (
+    METHOD,
+    MODELS,
+    OBSERVATION,
+    RESULTS,
+    SLAVES,
     TEXT_FORMAT,
+    TIME,
     InProcess,
     Insecure,
     LogStyle,
@@ -49,56 +55,100 @@ log = logging.getLogger("master_node")
 
 def run(  # noqa: PLR0917  options of the command line
     system_file: SystemFile,
-    output: Annotated[Path, typer.Option(help="Directory for the results.")] = Path("results"),
+    output: Annotated[
+        Path, typer.Option(help="Directory for the results.", rich_help_panel=RESULTS)
+    ] = Path("results"),
     preset: Annotated[
-        str | None, typer.Option(help="paper: the method as Schierz, Arnold and Clauß have it.")
+        str | None,
+        typer.Option(
+            help="paper: the method as Schierz, Arnold and Clauß have it.", rich_help_panel=METHOD
+        ),
     ] = None,
     order: Annotated[
-        str | None, typer.Option(help="Degree k of the input polynomials, 0 to 3, or auto.")
+        str | None,
+        typer.Option(
+            help="Degree k of the input polynomials, 0 to 3, or auto.", rich_help_panel=METHOD
+        ),
     ] = None,
     derivative_points: Annotated[
         int | None,
-        typer.Option(min=0, max=2, help="Points at which input polynomials meet derivatives."),
+        typer.Option(
+            min=0,
+            max=2,
+            help="Points at which input polynomials meet derivatives.",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     estimator: Annotated[
-        str | None, typer.Option(help="rich, mod, or none for a fixed step.")
+        str | None,
+        typer.Option(help="rich, mod, or none for a fixed step.", rich_help_panel=METHOD),
     ] = None,
-    relative_tolerance: Annotated[float | None, typer.Option(help="RTOL of all outputs.")] = None,
-    absolute_tolerance: Annotated[float | None, typer.Option(help="ATOL of all outputs.")] = None,
-    start_time: Annotated[float | None, typer.Option(help="First time of the run [s].")] = None,
-    stop_time: Annotated[float | None, typer.Option(help="Last time of the run [s].")] = None,
+    relative_tolerance: Annotated[
+        float | None, typer.Option(help="RTOL of all outputs.", rich_help_panel=METHOD)
+    ] = None,
+    absolute_tolerance: Annotated[
+        float | None, typer.Option(help="ATOL of all outputs.", rich_help_panel=METHOD)
+    ] = None,
+    start_time: Annotated[
+        float | None, typer.Option(help="First time of the run [s].", rich_help_panel=TIME)
+    ] = None,
+    stop_time: Annotated[
+        float | None, typer.Option(help="Last time of the run [s].", rich_help_panel=TIME)
+    ] = None,
     controller: Annotated[
-        str | None, typer.Option(help="Controller of the step size: pi or elementary.")
+        str | None,
+        typer.Option(help="Controller of the step size: pi or elementary.", rich_help_panel=METHOD),
     ] = None,
     sequence: Annotated[
-        str | None, typer.Option(help="jacobi: all slaves at once; gauss-seidel: one by one.")
+        str | None,
+        typer.Option(
+            help="jacobi: all slaves at once; gauss-seidel: one by one.", rich_help_panel=METHOD
+        ),
     ] = None,
     coupling: Annotated[
         str | None,
-        typer.Option(help="explicit; implicit: iterate each double step; auto: where it is stiff."),
+        typer.Option(
+            help="explicit; implicit: iterate each double step; auto: where it is stiff.",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     output_interval: Annotated[
-        float | None, typer.Option(help="Write results at multiples of this [s].")
+        float | None,
+        typer.Option(help="Write results at multiples of this [s].", rich_help_panel=RESULTS),
     ] = None,
     output_variables: Annotated[
         list[str] | None,
-        typer.Option(help="Pattern for slave.variable; !PATTERN leaves out; may be repeated."),
+        typer.Option(
+            help="Pattern for slave.variable; !PATTERN leaves out; may be repeated.",
+            rich_help_panel=RESULTS,
+        ),
     ] = None,
     output_locals: Annotated[
         list[str] | None,
-        typer.Option(help="Pattern for variables that are no outputs; may be repeated."),
+        typer.Option(
+            help="Pattern for variables that are no outputs; may be repeated.",
+            rich_help_panel=RESULTS,
+        ),
     ] = None,
     output_every: Annotated[
-        int | None, typer.Option(help="Keep each N-th result point, the first and the last.")
+        int | None,
+        typer.Option(
+            help="Keep each N-th result point, the first and the last.", rich_help_panel=RESULTS
+        ),
     ] = None,
     output_format: Annotated[
-        list[str] | None, typer.Option(help="csv, arrow, parquet or mat; may be repeated.")
+        list[str] | None,
+        typer.Option(help="csv, arrow, parquet or mat; may be repeated.", rich_help_panel=RESULTS),
     ] = None,
     step_size: Annotated[
-        float | None, typer.Option(help="Initial communication step size, or the fixed one [s].")
+        float | None,
+        typer.Option(
+            help="Initial communication step size, or the fixed one [s].", rich_help_panel=TIME
+        ),
     ] = None,
     case: Annotated[
-        Path | None, typer.Option(help="Parameters of a run of a study, its case.toml.")
+        Path | None,
+        typer.Option(help="Parameters of a run of a study, its case.toml.", rich_help_panel=MODELS),
     ] = None,
     parameter: Parameter = None,
     state: State = None,
@@ -112,17 +162,27 @@ def run(  # noqa: PLR0917  options of the command line
     package_bus: PackageBus = False,
     timeout: Timeout = None,
     pin: Annotated[
-        bool, typer.Option("--pin", help="Keep each launched slave on one processor.")
+        bool,
+        typer.Option(
+            "--pin", help="Keep each launched slave on one processor.", rich_help_panel=SLAVES
+        ),
     ] = False,
     no_examine: NoExamine = False,
     trace: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Trace of all requests, for Perfetto.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Trace of all requests, for Perfetto.", rich_help_panel=OBSERVATION
+        ),
     ] = None,
     metrics_port: MetricsPort = None,
     metrics_host: MetricsHost = LOOPBACK,
     log_format: LogStyle = LogFormat.TEXT,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
-    no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw no results.png.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="No progress, no summary.", rich_help_panel=OBSERVATION)
+    ] = False,
+    no_plot: Annotated[
+        bool, typer.Option("--no-plot", help="Draw no results.png.", rich_help_panel=RESULTS)
+    ] = False,
     stay_with_parent: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Run SYSTEM and write results, by default results.csv, steps, summary and a picture."""

@@ -13,6 +13,7 @@ from master_node.system.system import System
 from protocol.bus.bus import Bus
 from protocol.errors import ModelError, ProtocolError, SlaveLostError
 from protocol.host.files import Contents, as_file, is_fmu
+from protocol.text.references import split_reference
 from protocol.wire.agents import (
     CHUNK_BYTES,
     AgentModel,
@@ -81,10 +82,10 @@ def wanted_model(system: System, slave: str) -> WantedModel:
         ModelError: its file cannot be read.
     """
     model = str(system.slaves[slave].model)
-    place, colon, python_class = model.rpartition(":")
-    is_python = bool(colon) and not is_fmu(model, system.base)
-    path = place if is_python else model.rstrip("/\\")
-    python_class = f":{python_class}" if is_python else ""
+    reference = None if is_fmu(model, system.base) else split_reference(model)
+    is_python = reference is not None
+    path = model.rstrip("/\\") if reference is None else reference[0]
+    python_class = "" if reference is None else f":{reference[1]}"
     file_name = path.replace("\\", "/").rpartition("/")[2]
     file = system.base / path
     try:

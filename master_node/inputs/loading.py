@@ -24,6 +24,7 @@ from protocol.errors import ConfigurationError
 from protocol.host.user_code import load_module, user_context
 from protocol.signals import FloatArray
 from protocol.text.names import nearest
+from protocol.text.references import split_reference
 from protocol.variables import StartValue
 
 _READ = {*SUFFIXES, ".npy", ".npz"}
@@ -214,8 +215,8 @@ def _function(setting: InputSettings, system: System) -> SignalFunction:
 
 
 def _load_function(reference: str, base: Path) -> Callable[[float], Any]:
-    place, separator, name = reference.rpartition(":")
-    if not (separator and place and name):
+    place, name = split_reference(reference) or ("", "")
+    if not (place and name):
         raise ConfigurationError(
             f"{reference!r} does not name a function",
             remedy="write package.module:name or path/to/file.py:name",

@@ -14,7 +14,7 @@ from protocol.variables import Causality
 
 
 def check_capabilities(coupled: CoupledSystem, system: System) -> list[str]:
-    """What the slaves' capabilities mean for this run, as warnings for the user.
+    """Warnings of what the slaves' capabilities mean for this run.
 
     Raises:
         ConfigurationError: an estimator was asked for and a slave cannot change its step size and

@@ -20,6 +20,7 @@ from typing import Any
 import tomli_w
 
 from master_node.system.places import SspPlaces
+from master_node.system.single import is_model, single_system
 from master_node.system.ssp.flattening import FlatConnection, Slave, flatten
 from master_node.system.ssp.reading import read_structure
 from master_node.system.ssp.structure import Notes, Structure
@@ -54,7 +55,7 @@ class ImportedSystem:
 
 @contextmanager
 def open_system(path: Path | str, *, package_bus: bool = False) -> Iterator[System]:
-    """The system in a ``.toml``, ``.ssp`` or ``.ssd`` file.
+    """The system in a ``.toml``, ``.ssp`` or ``.ssd`` file, or of one model alone.
 
     ``package.ssp#Variant.ssd`` is another description of a package than its
     ``SystemStructure.ssd``. The models of a package are extracted into a temporary directory,
@@ -62,7 +63,7 @@ def open_system(path: Path | str, *, package_bus: bool = False) -> Iterator[Syst
     not carried is logged.
 
     Args:
-        path: the file.
+        path: the file; or an FMU, or ``package.module:Class``, see `single_system`.
         package_bus: take ``[bus]`` from the annotation of an SSP file: to whom it connects, where
             it listens, with which certificates.
 
@@ -70,6 +71,9 @@ def open_system(path: Path | str, *, package_bus: bool = False) -> Iterator[Syst
         ConfigurationError: the file is missing or wrong, or holds what is not supported.
     """
     path = Path(path)
+    if is_model(path):
+        yield single_system(path)
+        return
     if not is_ssp(path):
         yield load_system(path)
         return

@@ -40,6 +40,7 @@ from master_node.system.fields import (
     Wait,
     mapping_entries,
 )
+from protocol.text.references import split_reference
 from protocol.wire.administration import DEFAULT_LOAD_TIMEOUT
 
 
@@ -227,7 +228,7 @@ class InputSettings(FrozenTable):
         """
         name: object = self.table
         if isinstance(self.function, str):
-            name = self.function.rpartition(":")[0]
+            name = (split_reference(self.function) or ("",))[0]
         return name if isinstance(name, str) and (base / name).is_file() else None
 
     @field_serializer("table", "function")

@@ -31,6 +31,7 @@ from protocol.errors import (
 from protocol.host.clock import SYSTEM_CLOCK
 from protocol.host.processes import PeerProcess
 from protocol.slave_processes import SlaveProcess, end_all
+from protocol.text.references import split_reference
 from protocol.wire.agents import (
     AGENT_MESSAGE_BYTES,
     LICENCE,
@@ -366,7 +367,7 @@ class Agent:
 
     def _model(self, model: str) -> tuple[Path, str]:
         """Directory and name of a model that may be started."""
-        if ":" in model:
+        if split_reference(model) is not None:
             return self._python_model(model)
         store, cache = self._offer.store, self._offer.cache
         if is_sha256(model):
@@ -388,7 +389,7 @@ class Agent:
                 f"it starts no Python models, such as {model!r:.140}",
                 remedy="start the agent with --allow-python, or export the model as an FMU",
             )
-        place, _, name = model.rpartition(":")
+        place, name = split_reference(model) or ("", "")
         is_file = place.endswith(".py") and self._offer.store.has(place)
         is_installed = not place.endswith(".py") and _INSTALLED_MODEL.fullmatch(place)
         if not (_CLASS.fullmatch(name) and (is_file or is_installed)):

@@ -18,6 +18,7 @@ from protocol.bus.endpoints import LOOPBACK, Endpoints, Mode
 from protocol.errors import DoublestepError
 from protocol.host.logs import LogFormat, configure_logs
 from protocol.host.toml_text import assigned_values
+from protocol.text.references import split_reference
 from protocol.wire.administration import DEFAULT_LOAD_TIMEOUT
 from protocol.wire.keys import SlaveKey, check_name
 from slave_node.cli.options import (
@@ -168,7 +169,8 @@ def _counting(worker: Worker, name: str, stack: ExitStack, port: int, host: str)
 
 
 def _default_name(model: str, base: Path) -> str:
-    if ":" in model:
-        return model.rpartition(":")[2]
+    reference = split_reference(model)
+    if reference is not None:
+        return reference[1]
     path = (base / model).resolve()
     return path.name if path.is_dir() else path.stem

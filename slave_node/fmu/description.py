@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 from fmpy import read_model_description
 
-from protocol.description import SlaveDescription, StateKind
+from protocol.description import Experiment, SlaveDescription, StateKind
 from protocol.errors import ModelError
 from protocol.host.files import DESCRIPTION, Contents
 from protocol.host.scratch import ScratchDirectory
@@ -20,7 +20,7 @@ from slave_node.fmu.archive import extract
 from slave_node.fmu.embedded_python import log_categories, slave_module
 from slave_node.fmu.interfaces import (
     Interface,
-    default_step_size,
+    default_experiment,
     interface_1,
     interface_2,
     interface_3,
@@ -45,6 +45,7 @@ class FmuModel:
         structural_parameters: values that differ from the start values.
         token: GUID or instantiation token, as the FMU wants to hear it.
         log_categories: all.
+        experiment: that it suggests.
     """
 
     fmu: Path
@@ -55,6 +56,7 @@ class FmuModel:
     structural_parameters: Mapping[str, StartValue]
     token: str
     log_categories: tuple[str, ...]
+    experiment: Experiment
 
 
 def describe_fmu(fmu: Path) -> SlaveDescription:
@@ -109,6 +111,7 @@ def read_fmu(
             structural_parameters or {},
             model_description.guid or "",
             log_categories(directory, [c.name for c in model_description.logCategories]),
+            default_experiment(model_description),
         )
     except ModelError as error:
         raise ModelError(f"{fmu}: {error.cause}", remedy=error.remedy) from error
@@ -167,7 +170,7 @@ def _description(
         state_reason="" if saves_state else _NO_STATE,
         input_derivatives=interface.input_derivatives,
         fixed_step_size=interface.fixed_step_size,
-        default_step_size=default_step_size(model_description),
+        default_step_size=default_experiment(model_description).step_size,
         units=units(model_description),
         remarks=remarks,
         sha256=Contents.of(fmu).sha256,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from protocol.description import Capabilities, InputDerivatives
+from protocol.description import Capabilities, Experiment, InputDerivatives
 from protocol.errors import ModelError
 
 _YES = ("true", "1")
@@ -111,7 +112,9 @@ def interface_2(model_description: Any, root: Element) -> Interface:
             can_handle_variable_step_size=has_variable_steps,
         ),
         input_derivatives=_native(bool(slave.canInterpolateInputs)),
-        fixed_step_size=None if has_variable_steps else default_step_size(model_description),
+        fixed_step_size=None
+        if has_variable_steps
+        else default_experiment(model_description).step_size,
         needs_execution_tool=bool(slave.needsExecutionTool),
         is_once_per_process=bool(slave.canBeInstantiatedOnlyOncePerProcess),
     )
@@ -150,12 +153,22 @@ def interface_3(model_description: Any, root: Element) -> Interface:
     )
 
 
-def default_step_size(model_description: Any) -> float | None:
-    """Step size of the default experiment [s], None if there is none."""
-    experiment = model_description.defaultExperiment
-    if experiment is None or experiment.stepSize is None or not float(experiment.stepSize) > 0.0:
+def default_experiment(model_description: Any) -> Experiment:
+    """The default experiment; what is no number, or makes no sense, is not given."""
+    given = model_description.defaultExperiment
+    start, stop = _number(given, "startTime"), _number(given, "stopTime")
+    step_size = _number(given, "stepSize")
+    if stop is not None and stop <= (start or 0.0):
+        start = stop = None
+    return Experiment(start, stop, step_size if step_size is not None and step_size > 0.0 else None)
+
+
+def _number(experiment: Any, name: str) -> float | None:
+    try:
+        number = float(getattr(experiment, name, None))  # type: ignore[arg-type]
+    except (TypeError, ValueError):
         return None
-    return float(experiment.stepSize)
+    return number if isfinite(number) else None
 
 
 def _model_exchange(version: int, model_description: Any) -> Interface:

@@ -9,6 +9,7 @@ from types import ModuleType
 from protocol.errors import ConfigurationError, ModelError
 from protocol.host.user_code import load_module
 from protocol.text.names import nearest
+from protocol.text.references import split_reference
 from slave_node.model import Model
 
 
@@ -24,8 +25,8 @@ def load_model_class(reference: str, base: Path) -> type[Model]:
     Raises:
         ModelError: no such module, file or class, the import failed, or no `Model`.
     """
-    place, separator, name = reference.rpartition(":")
-    if not (separator and place and name):
+    place, name = split_reference(reference) or ("", "")
+    if not (place and name):
         raise ModelError(
             f"'{reference}' does not name a model",
             remedy="write package.module:Class or path/to/file.py:Class",

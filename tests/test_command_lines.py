@@ -1,0 +1,204 @@
+"""What a stranger meets first: versions, help, completion, one model alone, names of models."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+
+import master_node.cli.app
+import slave_node.cli.app
+from master_node import Result, System, open_system, simulate
+from protocol.errors import ConfigurationError, InterruptedRunError, ModelError
+from protocol.text.references import split_reference
+from slave_node.cli.serve import _default_name
+from tests.interrupting import Interrupt
+from tests.quarter_car_case import EXAMPLES
+from tests.test_processes import MainCommand, command
+
+__all__ = ["command"]
+
+APPS = {"master-node": master_node.cli.app.app, "slave-node": slave_node.cli.app.app}
+
+
+def said(program: str, *words: object, **environment: str) -> str:
+    """Standard output of an installed command in a process of its own, which ends with 0."""
+    done = subprocess.run(
+        [str(Path(sys.executable).with_name(program)), *map(str, words)],
+        env={**os.environ, "COLUMNS": "80", **environment},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("program", APPS)
+def test_the_version_is_that_of_the_package(program: str) -> None:
+    """One line, exit code 0."""
+    assert said(program, "--version") == f"{program} of Doublestep {version('doublestep')}\n"
+
+
+@pytest.mark.parametrize("program", APPS)
+def test_help_names_every_command_in_a_section(program: str) -> None:
+    """Law: each command has a section and a summary that is not cut off on 80 columns."""
+    text = said(program, "--help")
+    names = [str(c.name) for c in APPS[program].registered_commands]
+    for name in names:
+        assert re.search(rf"^  {name} +[A-Z].*\.$", text, re.MULTILINE), name
+    assert "..." not in text.partition("COMMAND")[2].partition("\n")[2]
+    assert "\nCommands:" not in text
+    assert all(len(line) <= 80 for line in text.splitlines())
+
+
+@pytest.mark.parametrize("words", [("run",), ("check",), ("sweep",), ("list",)])
+def test_help_of_a_command_names_every_option_once(words: tuple[str, ...]) -> None:
+    """Sections lose none: the hidden ones are not shown."""
+    text = said("master-node", *words, "--help")
+    (info,) = [c for c in APPS["master-node"].registered_commands if c.name == words[0]]
+    assert info.callback is not None
+    shown = re.findall(r"^  (--[a-z-]+)", text, re.MULTILINE)
+    assert len(shown) == len(set(shown))
+    names = {
+        "--" + name.removeprefix("as_").replace("_", "-") for name in info.callback.__annotations__
+    }
+    hidden = {"--stay-with-parent", "--return", "--system-file", "--study-file"}
+    assert names - hidden <= {*shown, "--help"}
+    if words == ("run",):
+        titles = re.findall(r"^(\S.*):$", text, re.MULTILINE)
+        assert titles[:3] == ["Arguments", "Results", "Method"]
+
+
+@pytest.mark.parametrize("program", APPS)
+def test_shells_complete_commands(program: str) -> None:
+    """The script of bash asks the command, which answers with what begins so."""
+    variable = f"_{program.upper().replace('-', '_')}_COMPLETE"
+    first = str(APPS[program].registered_commands[0].name)
+    words = {"COMP_WORDS": f"{program} {first[:3]}", "COMP_CWORD": "1"}
+    assert first in said(program, **words, **{variable: "complete_bash"}).split()
+    assert variable in said(program, **{variable: "source_bash"})
+
+
+# ---- Names of models ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("reference", "expected"),
+    [
+        ("package.module:Class", ("package.module", "Class")),
+        ("models/a.py:Class", ("models/a.py", "Class")),
+        (r"C:\models\a.py:Class", (r"C:\models\a.py", "Class")),
+        ("C:/models/a.py:Class", ("C:/models/a.py", "Class")),
+        (r"\\server\share\a.py:Class", (r"\\server\share\a.py", "Class")),
+        (r"C:\a.fmu", None),
+        ("c:/a.fmu", None),
+        ("C:a.fmu", None),
+        ("C:", None),
+        ("x:Class", ("x", "Class")),
+        ("a.fmu", None),
+        ("", None),
+        (":Class", ("", "Class")),
+        ("module:", ("module", "")),
+        ("ab:", ("ab", "")),
+    ],
+)
+def test_a_drive_is_no_python_module(reference: str, expected: tuple[str, str] | None) -> None:
+    """A colon behind one letter is that of a drive, unless a name in Python follows it."""
+    assert split_reference(reference) == expected
+
+
+def test_names_of_slaves_of_models_with_a_drive(tmp_path: Path) -> None:
+    """By default a slave is called as the class, and never as what follows a drive."""
+    assert _default_name(r"C:\models\a.py:Wheel", tmp_path) == "Wheel"
+    assert ":" not in _default_name("C:/models/wheel.fmu", tmp_path)
+
+
+# ---- One model alone ----------------------------------------------------------------------------
+
+
+def test_an_fmu_alone_runs_its_default_experiment(
+    capability_dir: Path, tmp_path: Path, command: MainCommand
+) -> None:
+    """The same bits as the system that says all of it, at the points of its own step size."""
+    fmu = capability_dir / "plain_lag.fmu"
+    code, text = command("run", fmu, "--output", tmp_path / "alone", "--in-process")
+    assert code == 0, text
+    experiment = {"stop_time": 2.0, "initial_step_size": 0.01, "estimator": "none"}
+    system = System(slaves={"plain_lag": {"model": str(fmu)}}, simulation=experiment)
+    simulate(system, output=tmp_path / "system", in_process=True)
+    alone, whole = Result.load(tmp_path / "alone"), Result.load(tmp_path / "system")
+    assert alone.outputs.tobytes() == whole.outputs.tobytes()
+    assert (len(alone.time), alone.time[-1]) == (201, 2.0)
+    assert (tmp_path / "alone" / "results.png").exists()
+
+
+def test_options_win_over_the_default_experiment(
+    capability_dir: Path, tmp_path: Path, command: MainCommand
+) -> None:
+    """Times, step size, parameters by the slave's name."""
+    words = ("--stop-time", "0.5", "--step-size", "0.1", "--parameter", "plain_lag.x_start=3.0")
+    fmu = capability_dir / "plain_lag.fmu"
+    out = tmp_path / "out"
+    code, text = command("run", fmu, *words, "--in-process", "--output", out, "--no-plot")
+    assert code == 0, text
+    result = Result.load(out)
+    assert len(result.time) == 6
+    assert result.outputs[0, 0] == 3.0
+
+
+def test_an_unpacked_fmu_and_a_class_alone(
+    tmp_path: Path, fmu_dir: Path, command: MainCommand
+) -> None:
+    """A Python class suggests no stop time, which is said; with one it runs."""
+    wheel = f"{EXAMPLES / 'quarter_car.py'}:Wheel"
+    out = tmp_path / "out"
+    code, text = command("run", wheel, "--in-process", "--output", out)
+    assert code == 2
+    assert "stop_time is missing" in text
+    words = ("--stop-time", "0.1", "--in-process", "--output", out, "--no-plot", "--quiet")
+    assert command("run", wheel, *words)[0] == 0
+    assert len(Result.load(out).time) == 1001
+    folder = tmp_path / "wheel"
+    with ZipFile(fmu_dir / "wheel.fmu") as archive:
+        archive.extractall(folder)
+    with open_system(folder) as system:
+        assert list(system.slaves) == ["wheel"]
+
+
+def test_a_broken_off_run_of_one_model_is_resumed(capability_dir: Path, tmp_path: Path) -> None:
+    """It is a run like others: checkpoints, the same bits."""
+    with open_system(capability_dir / "plain_lag.fmu") as system:
+        simulate(system, output=tmp_path / "whole", in_process=True)
+        with pytest.raises(InterruptedRunError):
+            simulate(system, output=tmp_path / "parts", in_process=True, observers=[Interrupt(50)])
+    master_node.resume(tmp_path / "parts")
+    whole, parts = (tmp_path / name / "results.csv" for name in ("whole", "parts"))
+    assert whole.read_bytes() == parts.read_bytes()
+
+
+def test_a_model_that_is_not_there(tmp_path: Path) -> None:
+    """It is told as a model, not as a system file that is no TOML."""
+    with pytest.raises(ModelError, match="no such file"), open_system(tmp_path / "none.fmu"):
+        pass
+    with (
+        pytest.raises(ConfigurationError, match="no file"),
+        open_system(f"{tmp_path / 'none.py'}:Class"),
+    ):
+        pass
+
+
+def test_a_check_of_one_model(capability_dir: Path, command: MainCommand) -> None:
+    """Inputs that nothing feeds are what one wants to know of a model alone."""
+    code, text = command("check", capability_dir / "plain_lag.fmu", "--in-process")
+    assert code == 0
+    assert "plain_lag.u" in text
+    assert "fixed H" in text
