@@ -21,10 +21,13 @@ SEED := $(shell git rev-parse --short=8 HEAD 2>/dev/null)
 sample: $(DEVELOPED) fmus ## some of the slow tests, others for each commit
 	$(PYTEST) -m slow --sample 5 --seed "$(SEED)"
 
-check: $(DEVELOPED) ## linter, formatter, type checker, import layers
+POSIX := 'slave_node/states/(fork_|channel)'
+check: $(DEVELOPED) ## linter, formatter, type checker for three platforms, import layers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy --platform darwin --cache-dir .mypy_cache/darwin
+	$(BIN)/mypy --platform win32 --cache-dir .mypy_cache/win32 --exclude $(POSIX) --follow-imports silent
 	$(BIN)/lint-imports --no-cache
 
 fmus: $(INSTALLED) ## compile the example FMUs

@@ -26,7 +26,7 @@ from protocol.errors import (
     SlaveLostError,
 )
 from protocol.host.new_files import open_new, open_old
-from protocol.host.python_processes import python_command
+from protocol.host.python_processes import out_of_reach, python_command, temporary_files_in
 from protocol.wire.keys import SlaveKey
 
 _END_TIME = 2.0
@@ -85,8 +85,8 @@ class SlaveProcess:
                     stdin=subprocess.PIPE,
                     stdout=file,
                     stderr=subprocess.STDOUT,
-                    start_new_session=True,  # Ctrl-C is for who started it, who tells it
                     env=_environment(scratch),
+                    **out_of_reach(),  # who started it tells it
                 )
         except OSError as error:
             raise ConfigurationError(
@@ -194,5 +194,5 @@ def _environment(scratch: Path) -> dict[str, str]:
         **os.environ,
         "OPENBLAS_NUM_THREADS": "1",
         "OMP_NUM_THREADS": "1",
-        "TMPDIR": str(scratch),
+        **temporary_files_in(scratch),
     }

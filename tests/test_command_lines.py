@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 from importlib.metadata import version
 from pathlib import Path
 from zipfile import ZipFile
@@ -16,6 +18,8 @@ import master_node.cli.app
 import slave_node.cli.app
 from master_node import Result, System, open_system, simulate
 from protocol.errors import ConfigurationError, InterruptedRunError, ModelError
+from protocol.host.processes import ending_signals, interrupt_main_thread
+from protocol.host.python_processes import out_of_reach, temporary_files_in
 from protocol.text.references import split_reference
 from slave_node.cli.serve import _default_name
 from tests.interrupting import Interrupt
@@ -120,6 +124,44 @@ def test_names_of_slaves_of_models_with_a_drive(tmp_path: Path) -> None:
     """By default a slave is called as the class, and never as what follows a drive."""
     assert _default_name(r"C:\models\a.py:Wheel", tmp_path) == "Wheel"
     assert ":" not in _default_name("C:/models/wheel.fmu", tmp_path)
+
+
+# ---- Other platforms ----------------------------------------------------------------------------
+
+
+def test_processes_of_ours_are_out_of_reach_of_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A session of their own, and on Windows a process group, as there Ctrl-C goes to a console."""
+    assert out_of_reach() == {"start_new_session": True}
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 512, raising=False)
+    assert out_of_reach() == {"creationflags": 512}
+
+
+def test_temporary_files_are_where_all_platforms_look(tmp_path: Path) -> None:
+    """Python takes the first of these, and what an FMU asks on Windows one of the others."""
+    assert temporary_files_in(tmp_path) == dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(tmp_path))
+
+
+def test_ctrl_break_ends_a_command_on_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is one of the signals that ask for the end, where there is one."""
+    assert signal.SIGINT in ending_signals()
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(signal, "SIGBREAK", signal.SIGUSR1, raising=False)
+    assert signal.SIGUSR1 in ending_signals()
+
+
+def test_the_main_thread_is_interrupted_in_mid_wait() -> None:
+    """From another thread, at once: what it waits for does not have to end first."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    never = threading.Event()
+    timer = threading.Timer(0.05, interrupt_main_thread)
+    timer.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            never.wait(60.0)
+    finally:
+        timer.join()
+        signal.signal(signal.SIGINT, before)
 
 
 # ---- One model alone ----------------------------------------------------------------------------

@@ -169,12 +169,11 @@ def _opened_lock(path: Path) -> BinaryIO:
 
 def _lock_alone(file: BinaryIO) -> None:
     """Raises BlockingIOError when another process holds it. Windows has no such lock."""
-    if sys.platform == "win32":
-        return
-    import fcntl  # noqa: PLC0415  not on Windows
+    if sys.platform != "win32":
+        import fcntl  # noqa: PLC0415  not on Windows
 
-    try:
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a file system without locks
-            raise
+        try:
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a file system without locks
+                raise

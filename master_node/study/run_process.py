@@ -15,7 +15,7 @@ from master_node.study.case import Case, write_case
 from master_node.study.directory import put_in_place
 from master_node.study.records import CASE_FILE, LOG_FILE, RunRecord, write_record
 from protocol.errors import DeadlineError, ResultsError
-from protocol.host.python_processes import python_command
+from protocol.host.python_processes import out_of_reach, python_command, temporary_files_in
 from protocol.host.scratch import ScratchDirectory
 
 END_TIME = 0.2
@@ -77,8 +77,8 @@ class RunProcess:
                     stdin=subprocess.PIPE,
                     stdout=log,
                     stderr=subprocess.STDOUT,
-                    start_new_session=True,  # Ctrl-C is for the sweep, which ends its runs
                     env=_environment(self._scratch.path),
+                    **out_of_reach(),  # the sweep ends its runs
                 )
         except OSError as error:
             raise ResultsError(f"cannot start run {task.number}: {error}") from error
@@ -162,4 +162,4 @@ class RunProcess:
 def _environment(scratch: Path) -> dict[str, str]:
     """Runs beside each other are what uses the processors: no threads of NumPy within one."""
     quiet = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
-    return {**quiet, **os.environ, "TMPDIR": str(scratch)}
+    return {**quiet, **os.environ, **temporary_files_in(scratch)}

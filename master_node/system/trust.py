@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from protocol.errors import ConfigurationError
+from protocol.host.processes import user_id
 
 
 def check_own(paths: Iterable[Path]) -> None:
@@ -28,7 +29,7 @@ def check_own(paths: Iterable[Path]) -> None:
         except FileNotFoundError:
             continue
         cause = ""
-        if status.st_uid != os.getuid():
+        if status.st_uid != user_id():
             cause = f"is of another user (uid {status.st_uid})"
         elif status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
             cause = "can be written by everybody"

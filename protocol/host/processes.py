@@ -27,6 +27,14 @@ def ending_signals() -> list[signal.Signals]:
     return numbers
 
 
+def user_id() -> int:
+    """Number of the user of this process; -1 on Windows, which has none."""
+    if sys.platform == "win32":
+        return -1
+    else:  # noqa: RET505  what the type checker sees of a platform
+        return os.getuid()
+
+
 def interrupt_main_thread() -> None:
     """Send SIGINT to the main thread, from any thread; what it waits for is broken off.
 

@@ -7,9 +7,12 @@ whoever wrote a system file would run, or end the run.
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TypedDict
 
 _SAFE_PATH = "PYTHONSAFEPATH"
 
@@ -17,6 +20,26 @@ _SAFE_PATH = "PYTHONSAFEPATH"
 def python_command(*words: str) -> list[str]:
     """The command line of a Python process with the interpreter of this one."""
     return [sys.executable, "-P", *words]
+
+
+class OutOfReach(TypedDict, total=False):
+    """Arguments of `subprocess.Popen`, see `out_of_reach`."""
+
+    start_new_session: bool
+    creationflags: int
+
+
+def out_of_reach() -> OutOfReach:
+    """Arguments with which Ctrl-C reaches this process alone, and not the one that is started."""
+    if sys.platform == "win32":
+        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    else:  # noqa: RET505  what the type checker sees of a platform
+        return {"start_new_session": True}
+
+
+def temporary_files_in(scratch: Path) -> dict[str, str]:
+    """Environment in which a process, and what it loads, has its temporary files in a directory."""
+    return dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(scratch))
 
 
 @contextmanager

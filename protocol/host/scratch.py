@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from protocol.host.directory_locks import lock_directory
+from protocol.host.processes import user_id
 
 PREFIX = "doublestep-scratch-"
 """With which the names of all of them begin, in ``TMPDIR``."""
@@ -64,7 +65,7 @@ def _remove_abandoned(parent: Path) -> None:
     with suppress(OSError):
         for entry in list(os.scandir(parent)):
             with suppress(OSError):  # another process was there first, or it is held
-                is_ours = entry.stat(follow_symlinks=False).st_uid == os.getuid()
+                is_ours = entry.stat(follow_symlinks=False).st_uid == user_id()
                 if entry.name.startswith(PREFIX) and is_ours:
                     _remove_if_abandoned(Path(entry.path))
 

@@ -20,6 +20,7 @@ from secrets import token_hex
 
 from protocol.errors import ConfigurationError, ModelError, ProtocolError, SlaveBusyError
 from protocol.host.files import file_sha256
+from protocol.host.processes import user_id
 from protocol.wire.agents import AgentModel, Upload, UploadState, is_sha256
 
 log = logging.getLogger("slave_node")
@@ -69,7 +70,7 @@ class UploadCache:
         except OSError as error:
             raise ConfigurationError(f"{directory} cannot be used: {error}") from error
         if os.name == "posix" and (
-            status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+            status.st_uid != user_id() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
         ):
             raise ConfigurationError(
                 f"{directory}: others can write into the directory of uploaded models",

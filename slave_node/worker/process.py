@@ -266,17 +266,18 @@ def _start_guard(process: BaseProcess, pipe: Pipe) -> threading.Thread | None:
 
     Such processes hold the worker's end of the pipe, so that its death could not be seen there.
     """
-    if sys.platform != "linux" or process.pid is None:
-        return None
     worker = process.pid
-    return start_thread(lambda: _end_with(worker, pipe), "guard")
+    if sys.platform == "linux" and worker is not None:
+        return start_thread(lambda: _end_with(worker, pipe), "guard")
+    return None
 
 
 def _end_with(worker: int, pipe: Pipe) -> None:
-    with suppress(ChildProcessError):
-        os.waitid(os.P_PID, worker, os.WEXITED | os.WNOWAIT)
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(worker, signal.SIGKILL)
+    if sys.platform == "linux":
+        with suppress(ChildProcessError):
+            os.waitid(os.P_PID, worker, os.WEXITED | os.WNOWAIT)
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(worker, signal.SIGKILL)
     pipe.hang_up()
 
 
