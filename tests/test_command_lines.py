@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -244,3 +245,19 @@ def test_a_check_of_one_model(capability_dir: Path, command: MainCommand) -> Non
     assert code == 0
     assert "plain_lag.u" in text
     assert "fixed H" in text
+
+
+# ---- Tables on 80 columns -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fmu", ["all_types3", "many_variables", "plain_lag"])
+def test_tables_of_models_keep_80_columns(fmu: str, capability_dir: Path) -> None:
+    """Law: no line is longer, and the words of every description are there as a whole."""
+    path = capability_dir / f"{fmu}.fmu"
+    text = said("slave-node", "inspect", path)
+    assert max(map(len, text.splitlines())) <= 80
+    told = json.loads(said("slave-node", "inspect", path, "--json"))
+    shown = re.sub(r"\s", "", text)
+    for variable in told["variables"][:50]:
+        for word in variable["description"].split():
+            assert word[:12] in shown, (variable["name"], word)

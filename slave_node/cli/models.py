@@ -26,7 +26,7 @@ def inspect(
     with interruptible(), output_of_others():
         description = describe_model(model, Path.cwd())
     if as_json:
-        say_json(_finite(asdict(description)))
+        say_json(_plain(asdict(description)))
         return
     from protocol.host.tables import show
 
@@ -64,13 +64,15 @@ def validate(
         raise unusable(model)
 
 
-def _finite(value: Any) -> Any:
-    """Value with texts for the numbers that JSON does not have."""
+def _plain(value: Any) -> Any:
+    """Value with texts for what JSON does not have: some numbers, and bytes."""
     match value:
         case dict():
-            return {key: _finite(item) for key, item in value.items()}
+            return {key: _plain(item) for key, item in value.items()}
         case list() | tuple():
-            return [_finite(item) for item in value]
+            return [_plain(item) for item in value]
         case float() if not math.isfinite(value):
             return str(value)
+        case bytes():
+            return value.hex()
     return value

@@ -8,7 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Column, Table
 
 from protocol.description import SlaveDescription
-from protocol.host.tables import plain
+from protocol.host.tables import lines, plain
 from protocol.values import item_name
 from protocol.variables import Variable
 from slave_node.validation.trials import Finding, Grade
@@ -86,30 +86,25 @@ def _state(description: SlaveDescription) -> str:
 
 
 def _variables(description: SlaveDescription) -> Table:
+    """All that is said of each variable, in columns that leave room for its description."""
     table = Table(title="Variables", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("name", overflow="fold", min_width=8)
-    for column in ("causality", "variability", "type", "unit"):
-        table.add_column(column, no_wrap=True)
-    table.add_column("start", no_wrap=True, justify="right")
-    table.add_column("nominal", no_wrap=True, justify="right")
-    has_bounds = any(v.has_bounds for v in description.variables)
-    if has_bounds:
-        table.add_column("values", overflow="fold", min_width=8)
-    table.add_column("description", min_width=12)
+    table.add_column("kind", overflow="fold", min_width=9)
+    for column in ("type", "unit"):
+        table.add_column(column, overflow="fold")
+    table.add_column("start", overflow="fold", justify="right")
+    table.add_column("description", overflow="fold", min_width=12)
     for v in description.variables:
-        cells = (
-            v.name,
-            v.causality.value,
-            v.variability,
-            v.type.value,
-            v.unit,
-            _start(v),
-            "" if v.nominal == 1.0 else str(v.nominal),
-            *((_values(v),) if has_bounds else ()),
-            v.description,
-        )
-        table.add_row(*map(plain, cells))
+        about = [v.description, _values(v), "" if v.nominal == 1.0 else f"nominal {v.nominal}"]
+        cells = (v.name, _kind(v), v.type.value, v.unit, _start(v))
+        table.add_row(*map(plain, cells), lines(filter(None, about)))
     return table
+
+
+def _kind(variable: Variable) -> str:
+    """Causality, with the variability where it is not that of a signal."""
+    is_usual = variable.variability == "continuous"
+    return variable.causality.value if is_usual else f"{variable.variability} {variable.causality}"
 
 
 def _start(variable: Variable) -> str:
