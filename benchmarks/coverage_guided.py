@@ -12,7 +12,7 @@ from argparse import ArgumentParser
 from importlib.util import find_spec
 from pathlib import Path
 
-_SCRIPT = Path(__file__).parents[1] / "tests" / "fuzz" / "coverage_guided.py"
+_SCRIPT = Path(__file__).parents[1] / "tests" / "faults" / "fuzz" / "coverage_guided.py"
 _HANG_TIME = 60
 _MEMORY_MB = 500
 _STATUS = re.compile(r"#(\d+)\s+DONE\s+cov: (\d+) .*rss: (\d+)Mb")
@@ -22,7 +22,7 @@ def main(words: list[str]) -> None:
     """Run and print a table.
 
     Raises:
-        SystemExit: Atheris is not installed, or a law of `tests.fuzz.harness` did not hold.
+        SystemExit: Atheris is not installed, or a law of `tests.faults.fuzz.harness` did not hold.
     """
     parser = ArgumentParser(prog="python -m benchmarks coverage_guided", description=__doc__)
     parser.add_argument("--runs", type=int, default=1_000_000)

@@ -20,7 +20,7 @@ import tomli_w
 
 from master_node import System, load_system, simulate
 from protocol.errors import DoublestepError
-from tests.nemesis.systems import EXAMPLES, draw_system
+from tests.faults.nemesis.systems import EXAMPLES, draw_system
 
 _DIGESTED = ("results.csv", "steps.csv")
 _ATTEMPTS = 2000

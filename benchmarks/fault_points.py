@@ -12,14 +12,14 @@ from pathlib import Path
 from time import perf_counter
 
 from benchmarks.quarter_car import EXAMPLE
-from tests.fault_points import NUMBER, router, run_point
+from tests.faults.fault_points import NUMBER, router, run_point
 
 
 def main(words: list[str]) -> None:
     """Run and print a table.
 
     Raises:
-        SystemExit: the law of `tests.fault_points` did not hold.
+        SystemExit: the law of `tests.faults.fault_points` did not hold.
     """
     parser = ArgumentParser(prog="python -m benchmarks fault_points", description=__doc__)
     parser.add_argument("--points", type=int, default=NUMBER)

@@ -2,7 +2,8 @@
 
 ``python -m benchmarks fault_schedules --schedules 10000``. Each schedule follows from its number.
 Ends with an error if a run gave other bits than undisturbed, did not end within its bound, or left
-a slave that another master cannot use; ``python -m tests.fault_schedules N`` repeats number N.
+a slave that another master cannot use; ``python -m tests.faults.fault_schedules N`` repeats number
+N.
 """
 
 import logging
@@ -12,7 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from time import perf_counter
 
-from tests.fault_schedules import Outcome, run_schedule
+from tests.faults.fault_schedules import Outcome, run_schedule
 
 _CHUNK = 50
 
@@ -21,7 +22,7 @@ def main(words: list[str]) -> None:
     """Run and print a table.
 
     Raises:
-        SystemExit: a law of `tests.fault_schedules` did not hold.
+        SystemExit: a law of `tests.faults.fault_schedules` did not hold.
     """
     parser = ArgumentParser(prog="python -m benchmarks fault_schedules", description=__doc__)
     parser.add_argument("--schedules", type=int, default=10_000)

@@ -14,7 +14,7 @@ from time import perf_counter
 
 import psutil
 
-from tests.fuzz.harness import fuzz
+from tests.faults.fuzz.harness import fuzz
 
 _CHUNK = 10_000
 _HANG_TIME = 60.0
@@ -27,7 +27,7 @@ def main(words: list[str]) -> None:
     """Run and print a table.
 
     Raises:
-        AssertionError: a law of `tests.fuzz.harness` did not hold, or the bounds on time and
+        AssertionError: a law of `tests.faults.fuzz.harness` did not hold, or the bounds on time and
             memory were not kept: for one message, and from the first messages to the last.
     """
     parser = ArgumentParser(prog="python -m benchmarks fuzz", description=__doc__)

@@ -1,7 +1,7 @@
 """Systems and faults that seeds draw, with real processes, and the same files after it all.
 
 ``python -m benchmarks nemesis --seeds 100``. Prints the seeds for which a law of
-`tests.nemesis.seeds` did not hold, and ends with an error then; ``--first`` repeats one.
+`tests.faults.nemesis.seeds` did not hold, and ends with an error then; ``--first`` repeats one.
 """
 
 import logging
@@ -13,9 +13,9 @@ from collections import Counter
 from pathlib import Path
 from time import monotonic
 
-from tests.fault_points import router
-from tests.nemesis.seeds import run_seed
-from tests.nemesis.systems import EXAMPLES
+from tests.faults.fault_points import router
+from tests.faults.nemesis.seeds import run_seed
+from tests.faults.nemesis.systems import EXAMPLES
 
 
 def main(words: list[str]) -> None:

@@ -26,8 +26,8 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
-from tests.signal_dispositions import default_dispositions
-from tests.waiting import BOUND, slowdown
+from tests.support.signal_dispositions import default_dispositions
+from tests.support.waiting import BOUND, slowdown
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -2,7 +2,7 @@
 
 Whatever waits, locks or begins something later does it through a `Clock` that it is given. So a
 test can let hours of lost and late messages pass in milliseconds, in an order that it chooses and
-can repeat (``tests/virtual_clock.py``).
+can repeat (``tests/support/virtual_clock.py``).
 """
 
 from __future__ import annotations
