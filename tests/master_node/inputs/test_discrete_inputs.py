@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -290,7 +291,7 @@ def test_what_is_legal_is_of_the_type(type_: VariableType, given_value: StartVal
         smallest, largest = type_.integer_range
         assert type(value) is int
         assert smallest <= value <= largest
-        assert value == (float(given_value) if isinstance(given_value, str) else given_value)
+        assert value == (Decimal(given_value) if isinstance(given_value, str) else given_value)
     elif type_.is_real:
         assert type(value) is float
         assert math.isfinite(value)
