@@ -187,7 +187,7 @@ def test_input_derivatives_where_declared(instance: Open, kind: type) -> None:
 def test_capabilities_are_what_they_say(  # noqa: PLR0917
     instance: Open, half: str, variant: str, kind: type, states: bool, derivatives: bool | None
 ) -> None:
-    """What the description denies is refused with a message, what it declares works.
+    """Capabilities that a description denies are refused with a message; those it declares work.
 
     ``None``: FMI 3.0 has no derivatives of inputs.
     """
@@ -372,7 +372,7 @@ def test_importer_can_end_a_step_early(instance: Open) -> None:
 
 
 def test_only_the_named_variables_can_be_set_in_between(instance: Open) -> None:
-    """What is not among the required intermediate variables is refused."""
+    """Variables that are not among the required intermediate variables are refused."""
     messages = []
 
     def importer(*_arguments: object) -> None:
@@ -451,7 +451,7 @@ SOUND_LAGS = (
 
 @pytest.mark.parametrize("name", [*SOUND_LAGS, "restarting_solver"])
 def test_lags_follow_their_inputs(instance: Open, name: str) -> None:
-    """As long as nothing is restored, these lags are right: with an input along a line, too."""
+    """These lags are right until a state is restored, with an input along a line, too."""
     made = started(instance(Slave2, name))
     made.set_derivatives(1, u=-2.0)
     for step_size in (0.1, 0.03, 0.2):
@@ -992,7 +992,7 @@ def test_archives_hold_their_sources(capability_dir: Path) -> None:
 
 @pytest.mark.slow
 def test_build_is_reproducible(capability_dir: Path, tmp_path: Path) -> None:
-    """The same sources give the same bytes, those of the stand-in library included."""
+    """Equal sources give equal bytes, those of the stand-in library included."""
     catalogue = sys.modules["capabilities.catalogue"]
     names = ("wheel_fmi1", "wheel_me3", "missing_library")
     fmus = [fmu for fmu in catalogue.FMUS if fmu.name in names]

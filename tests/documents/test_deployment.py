@@ -62,7 +62,7 @@ def endpoints(words: Sequence[str]) -> list[str]:
 
 
 def schema_errors(path: Path) -> subprocess.CompletedProcess[str]:
-    """What the schema of the Compose specification, as check-jsonschema ships it, says."""
+    """Findings of the schema of the Compose specification that check-jsonschema ships."""
     return subprocess.run(
         [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", path],
         capture_output=True,
@@ -252,7 +252,7 @@ def containers_of_compose() -> dict[str, tuple[list[str], list[str]]]:
 
 
 def containers_of_kubernetes() -> dict[str, tuple[list[str], list[str]]]:
-    """The same, out of the manifests."""
+    """Commands and health checks of all services, out of the manifests."""
     return {name: container_of_pod(name) for name in SERVICES}
 
 
@@ -300,7 +300,7 @@ def agent_of_compose() -> tuple[list[str], list[str]]:
 
 
 def agent_of_kubernetes() -> tuple[list[str], list[str]]:
-    """The same of the first pod; its name is that of its host."""
+    """Command and health check of the first pod of agents, named as its host."""
     command, health = container_of_pod("agent")
     assert "--name" not in command
     assert "$HOSTNAME" in health
@@ -471,7 +471,7 @@ def unit(path: Path) -> dict[str, dict[str, list[str]]]:
 
 
 def environment(path: Path) -> dict[str, str]:
-    """What a unit and its file of settings put into the environment."""
+    """Environment that a unit and its file of settings make."""
     service = unit(path)["Service"]
     values = dict(v.split("=", 1) for v in service["Environment"])
     if "CacheDirectory" in service:

@@ -1,4 +1,4 @@
-"""What the documents say is so: commands, keys, tables, examples, places in the code, links."""
+"""Documents are true: commands, keys, tables, examples, places in the code, links."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def blocks(text: str, language: str) -> list[str]:
 
 
 def section(text: str, heading: str) -> str:
-    """What stands under a heading, to the next one."""
+    """Text under a heading, up to the next one."""
     _, found, rest = text.partition(f"\n{heading}\n")
     assert found, f"no heading {heading!r}"
     return re.split(r"^#+ ", rest, maxsplit=1, flags=re.MULTILINE)[0]
@@ -187,7 +187,7 @@ def check_python(arguments: list[str]) -> list[str]:
 
 
 def help_of(program: str, command: str) -> str:
-    """What a command says of itself."""
+    """Help text of a command."""
     result = CliRunner().invoke(APPS[program], [command, "--help"], env={"COLUMNS": "200"})
     assert result.exit_code == 0
     return result.output
@@ -750,7 +750,7 @@ def test_links_lead_somewhere(path: Path) -> None:
 
 
 def anchors(text: str) -> set[str]:
-    """What a Markdown renderer makes of the headings."""
+    """Anchors that a Markdown renderer makes of the headings."""
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
 

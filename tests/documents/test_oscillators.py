@@ -182,7 +182,7 @@ def test_output_derivatives(load: Load, model: str) -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_a_saved_state_repeats_bit_for_bit(load: Load, model: str) -> None:
-    """As often as wanted, and serialized in another instance, a step leads to the same bits."""
+    """A step leads to the same bits any number of times, and from serialized bytes elsewhere."""
     values = {**MOVING[model][1], **START} if model in MOVING else {"before": 3.0, "after": 7.0}
     slave, other = load(model, values), load(model)
 

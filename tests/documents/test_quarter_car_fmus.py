@@ -211,7 +211,7 @@ def test_declared_feed_through(descriptions: dict[str, Any], model: str) -> None
 def test_build_is_reproducible(
     build_script: ModuleType, fmu_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same sources give the same bytes; what is up to date is left alone unless forced."""
+    """Equal sources give equal bytes; FMUs that are up to date are left alone unless forced."""
     script = build_script
     fmus = script.build(tmp_path)
     contents = [fmu.read_bytes() for fmu in fmus]
@@ -299,7 +299,7 @@ def test_setting_an_input_clears_its_derivatives_only(slave: SlaveFactory) -> No
 
 @pytest.mark.parametrize("model", MODELS)
 def test_output_derivatives(slave: SlaveFactory, model: str) -> None:
-    """What a slave tells as y' is what its outputs do, also where they contain u itself."""
+    """Output derivatives are the slopes of the outputs, also where these contain u itself."""
     made = slave(model).initialize(1e-13, x=0.02, v=-0.1)
     made.set_inputs(polynomial_inputs(model, 3))
     made.step(0.1)
@@ -524,7 +524,7 @@ def damage(block: bytes, offset: int) -> bytes:
 def test_damaged_state_is_refused(
     slave: SlaveFactory, change: Callable[[bytes], bytes], reason: str
 ) -> None:
-    """What is not a whole state of this model is refused with the reason."""
+    """Bytes that are not a whole state of this model are refused with the reason."""
     made = prepared(slave, "wheel")
     saved = made.fmu.getFMUstate()
     block = change(made.fmu.serializeFMUstate(saved))
@@ -658,7 +658,7 @@ def test_tolerance_out_of_reach_is_a_warning(slave: SlaveFactory) -> None:
 def test_failed_step_is_an_error_that_can_be_undone(
     slave: SlaveFactory, fault: dict[str, float]
 ) -> None:
-    """What is not finite ends in an error with a reason, not in NaN; a saved state leads back."""
+    """Infinite values end in an error with a reason, not in NaN; a saved state leads back."""
     made = slave("wheel")
     made.fmu.setupExperiment()
     made.fmu.enterInitializationMode()

@@ -40,7 +40,7 @@ _PARTS = ("node", "worker")
 
 
 class Fault(NamedTuple):
-    """What happens to whom.
+    """Fault of one process or link.
 
     Attributes:
         kind: ``kill``, ``stop`` or ``cut``.

@@ -50,12 +50,12 @@ FREE_TIME = RECONNECT_TIME + 2.0 * ORPHAN_TIME + 60.0
 
 
 class BrokenLawError(AssertionError):
-    """What must not happen has happened."""
+    """A law of the schedules was broken."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one schedule.
+    """Outcome of one schedule.
 
     Attributes:
         what: ``same bits``, or the class of the error.

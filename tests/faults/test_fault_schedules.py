@@ -49,7 +49,7 @@ def test_a_disturbed_run_has_the_same_bits_or_a_named_failure(schedules: int) ->
 
 
 def test_a_schedule_follows_from_its_seed() -> None:
-    """The same outcome to the last digit of its time, so that a number repeats what was found."""
+    """A seed gives one outcome to the last digit of its time, so a number repeats a find."""
     for seed in range(20):
         first, second = run_schedule(seed), run_schedule(seed)
         assert replace(first, error="") == replace(second, error="")  # it names wall-clock times
@@ -59,7 +59,7 @@ def test_a_schedule_follows_from_its_seed() -> None:
 
 
 def find() -> BaseException:
-    """What the first schedule that finds something raises; it names its seed."""
+    """Error of the first schedule that finds something; it names its seed."""
     for seed in range(ENOUGH):
         try:
             run_schedule(seed)
@@ -106,7 +106,7 @@ def test_a_slave_that_keeps_a_vanished_master_is_found(monkeypatch: pytest.Monke
 
 
 def test_a_slave_that_is_not_reset_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What one run left behind would be in the next one."""
+    """Leftovers of one run would be in the next one."""
     monkeypatch.setattr(SlaveNode, "_renew", lambda *_: None)
     monkeypatch.setattr(SlaveNode, "_reset", lambda *_: None)
     assert "another run on the same slaves" in str(find())
@@ -244,7 +244,7 @@ def test_each_fault_shows(faults: Faults, symptom: str) -> None:
 
 
 def test_tokens_follow_links_and_blink() -> None:
-    """Who watches hears every change in order; a cut that is not noticed changes nothing."""
+    """Watchers hear every change in order; a cut that is not noticed changes nothing."""
     clock = VirtualClock()
     network = Network(clock, Random(1), NO_FAULTS)
     server, client = network.join("server"), network.join("client")

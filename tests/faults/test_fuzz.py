@@ -48,7 +48,7 @@ def test_every_message_follows_from_seed_and_number() -> None:
 
 
 def test_valid_messages_are_taken() -> None:
-    """What the mutator begins with is valid for the decoder that gets it."""
+    """Messages that the mutator begins with are valid for the decoder that gets them."""
     for kind in KINDS[:3]:
         for number, data in enumerate(kind.examples):
             assert harness.decode(kind, number, data) == "taken", (kind.name, number)

@@ -33,7 +33,7 @@ CUT = 2.0
 
 
 def steps_on_disk(directory: Path) -> int:
-    """How many attempts the results directory holds."""
+    """Number of attempts in the results directory."""
     return len(Result.load(directory).steps)
 
 

@@ -77,7 +77,7 @@ def nap(folder: Path) -> dict[str, object]:
 
 
 def chassis_words(folder: Path) -> list[object]:
-    """How to serve it."""
+    """Words of the command that serves the chassis."""
     parameters = [f"{name}={toml(value)}" for name, value in nap(folder).items()]
     return [
         f"{MODELS}:Napper",

@@ -98,7 +98,7 @@ class Command:
 
     @property
     def killed(self) -> bool:
-        """Whether a signal ended it that it could not do anything about."""
+        """True when a signal ended the command before it could react."""
         code = self._process.poll()
         return code is not None and code < 0
 
@@ -234,7 +234,7 @@ def endpoints(number: int) -> list[str]:
 
 
 def has_stepped(directory: Path) -> bool:
-    """Whether steps have reached the disk."""
+    """True when steps have reached the disk."""
     try:
         return len(Result.load(directory).steps) > 0
     except ResultsError:  # not begun
@@ -273,7 +273,7 @@ def assert_readable(directory: Path) -> Result:
 
 
 def assert_summary(directory: Path, outcome: str) -> Result:
-    """The same, with a summary that agrees."""
+    """Asserts readable results with a summary that agrees, and returns them."""
     result = assert_readable(directory)
     assert result.summary["outcome"] == outcome
     assert result.summary["communication_steps"] == len(result.time) - 1
@@ -831,7 +831,7 @@ def test_a_wrong_command_line(
 
 
 def help_into(output: IO[bytes], module: str) -> subprocess.CompletedProcess[bytes]:
-    """What a command says of itself, written there."""
+    """Help text of a command, written to ``output``."""
     return subprocess.run(
         [sys.executable, "-m", module, "--help"],
         stdout=output,
@@ -843,7 +843,7 @@ def help_into(output: IO[bytes], module: str) -> subprocess.CompletedProcess[byt
 
 @pytest.mark.parametrize("module", ["master_node", "slave_node"])
 def test_a_reader_that_has_left_changes_nothing(module: str) -> None:
-    """As with ``| head``: no message and the same exit code, as 1 has a meaning."""
+    """A reader that leaves, as ``| head``, causes neither a message nor another exit code."""
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as closed:

@@ -81,7 +81,7 @@ def files(system: System, folder: Path, **options: Any) -> tuple[bytes, bytes]:
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What the user was warned of."""
+    """Warnings that the user got."""
     return [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
 
 
@@ -199,7 +199,7 @@ class HolderKiller:
 def test_killed_saved_states_change_nothing(
     seed: int, estimator: str, tmp_path: Path, fmu_dir: Path
 ) -> None:
-    """As the kernel kills that runs out of memory: whichever process that it meets, the same files.
+    """Kills as of a kernel out of memory: the same files, whichever process they meet.
 
     Most of them have not been asked for anything yet when they are killed.
     """
@@ -425,7 +425,7 @@ def wheel(scratch: Path) -> SlaveLink:
 
 
 def told(link: SlaveLink, *calls: Call) -> Reply:
-    """What a slave answers."""
+    """Reply of a slave to ``calls``."""
     link.start(calls)
     return link.finish()
 
@@ -526,7 +526,7 @@ class Forgetful:
         self.link.start(calls)
 
     def finish(self) -> Reply:
-        """As it is."""
+        """Handed on to the link."""
         return self.link.finish()
 
 
@@ -538,11 +538,11 @@ class Mortal:
         self.is_dead = False
 
     def start(self, calls: Sequence[Call]) -> None:
-        """As it is."""
+        """Handed on to the link."""
         self.link.start(calls)
 
     def finish(self) -> Reply:
-        """As it is, or no more."""
+        """Handed on to the link, if it lives."""
         if self.is_dead:
             raise SlaveLostError("it died")
         return self.link.finish()
@@ -593,7 +593,7 @@ def test_a_saved_state_is_trusted_by_its_outputs(
 
 
 def assert_equal(a: list[object], b: list[object]) -> None:
-    """The same outputs, bit for bit."""
+    """Asserts that two replies end in equal outputs, bit for bit."""
     assert isinstance(a[-1], np.ndarray)
     assert isinstance(b[-1], np.ndarray)
     assert a[-1].tobytes() == b[-1].tobytes()
@@ -670,7 +670,7 @@ class Dying(Mortal):
         self.is_saving = False
 
     def start(self, calls: Sequence[Call]) -> None:
-        """As it is, unless it dies of that."""
+        """Handed on to the link, unless the slave dies of that."""
         self.is_saving = any(type(call) is SerializeState for call in calls)
         self.is_dead = self.is_dead or self.is_saving
         if not self.is_dead:

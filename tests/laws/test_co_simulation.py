@@ -175,7 +175,7 @@ def test_the_tolerance_controls_the_error(
 
 
 def test_python_models_and_fmus_agree(fmu_dir: Path) -> None:
-    """The same equations in two languages: the same trajectory within the slaves' tolerance."""
+    """Equal equations in two languages give equal trajectories within the slaves' tolerance."""
     options = {"estimator": "none", "slave_tolerance": 1e-10, "stop_time": 1.0}
     fmus = completed(run_slaves(fmu_car(fmu_dir, **options)))
     models = completed(run_slaves(car(**options)))

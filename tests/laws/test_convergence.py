@@ -132,7 +132,7 @@ def test_emulated_inputs_cost_no_order(polynomial: InputPolynomial, sequence: st
 
 
 def test_mean_values_alone_are_of_second_order() -> None:
-    """What the moments are for: one substep has the mean value, and the order is 2 for any k."""
+    """Mean values alone, without further moments, are of order 2 for any k."""
 
     def mean(slave: Slave) -> Slave:
         return SubstepSlave(slave, InputDerivatives.EMULATED, 1)

@@ -35,7 +35,7 @@ def kick(oscillator_dir: Path, t_step: float = 1.0, **simulation: Any) -> Result
 
 
 def largest_error(oscillators: ModuleType, result: Result, t_step: float = 1.0) -> float:
-    """Of all outputs but the source's, at all points."""
+    """Largest error of all outputs but the source's, at all points."""
     names = [name for name in result.names if not name.startswith("source")]
     values = {"source.t_step": t_step}
     exact = oscillators.reference_solution("kick", names, result.time, values=values)
@@ -125,7 +125,7 @@ def test_a_declared_event_is_a_communication_point(
 def test_without_the_search_a_jump_is_stepped_over(
     oscillator_dir: Path, oscillators: ModuleType
 ) -> None:
-    """What the search is for: the estimates see nothing of a jump in the second small step."""
+    """Estimates see nothing of a jump in the second small step: the search is needed."""
     result = kick(oscillator_dir, discontinuities=False)
     assert result.summary["discontinuities"] == 0
     found = largest_error(oscillators, kick(oscillator_dir))

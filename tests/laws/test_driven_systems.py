@@ -54,7 +54,7 @@ def driven(jumps: Jumps, **simulation: Any) -> Result:
 
 
 def largest_error(result: Result, jumps: Jumps) -> float:
-    """Of the oscillator's states, at all points of the result."""
+    """Largest error of the oscillator's states, at all points of the result."""
     exact = np.zeros((len(result.time), 2))
     for i, time in enumerate(result.time.tolist()):
         for begin, jump in jumps:

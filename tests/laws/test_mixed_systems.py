@@ -44,7 +44,7 @@ class Listener(LinearSlave):
         super().set_inputs(derivatives)
 
     def highest_degree(self) -> int:
-        """Of the polynomials that it was given, as far as they were not just zeros."""
+        """Highest degree of the polynomials that it was given, leading zeros left out."""
         return max(int(np.flatnonzero(rows.any(axis=1)).max(initial=0)) for rows in self.heard)
 
 

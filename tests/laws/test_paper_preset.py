@@ -72,7 +72,7 @@ def test_a_key_beside_it_wins(tmp_path: Path, key: str) -> None:
 
 @pytest.mark.parametrize("key", [key for key in OTHERS if key != "order"])
 def test_on_the_command_line_it_wins_over_the_file(tmp_path: Path, key: str) -> None:
-    """Who asks for the paper's method there means all of it."""
+    """The preset on the command line replaces all that the file says of the method."""
     system = written(tmp_path, **{key: OTHERS[key]}, relative_tolerance=1e-3)
     found = system.with_simulation(preset="paper").simulation.model_dump()
     assert {k: found[k] for k in PAPER} == PAPER
@@ -90,7 +90,7 @@ def test_a_fixed_order_of_the_file_stays(tmp_path: Path, order: Any, kept: int) 
 
 @pytest.mark.parametrize("key", OTHERS)
 def test_a_key_beside_it_on_the_command_line_wins(tmp_path: Path, key: str) -> None:
-    """Whether the preset stands there too or in the file."""
+    """A key on the command line wins over the preset, there or in the file."""
     for system, preset in (
         (written(tmp_path), {"preset": "paper"}),
         (written(tmp_path, preset="paper"), {}),

@@ -211,7 +211,7 @@ def standing_in(state: LifeCycleState) -> tuple[Executor, Recorder]:
     ],
 )
 def test_every_call_in_every_state(state: LifeCycleState, kind: type[Call]) -> None:
-    """What the table has leads where it says; what it has not is refused unheard by the slave."""
+    """Calls in the table lead where it says; all others are refused unheard by the slave."""
     executor, slave = standing_in(state)
     heard, saved = len(slave.heard), executor.saved_states
     reply = executor.execute([EXAMPLES[kind]])

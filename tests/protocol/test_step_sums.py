@@ -64,7 +64,7 @@ def test_a_step_is_not_larger_than_the_largest(begin: float, length: float, part
 
 @dataclass
 class Told:
-    """What a slave knows of times [s]."""
+    """Times that a slave knows [s]."""
 
     stop: float = math.inf
     largest: float = math.inf

@@ -28,7 +28,7 @@ class Extracted:
         self.variables: dict[str, Any] = {v.name: v for v in self.description.modelVariables}
 
     def arguments(self) -> dict[str, Any]:
-        """What every class of FMPy wants to know."""
+        """Arguments of every class of FMPy."""
         return {
             "guid": self.description.guid,
             "unzipDirectory": self.folder,
@@ -259,7 +259,7 @@ class Model3(_Instance3):
 
 
 def vector(function: Any, n: int) -> np.ndarray:
-    """What a function of model exchange puts into an array of ``n`` numbers."""
+    """Array of ``n`` numbers, filled by a function of model exchange."""
     values = (c_double * n)()
     function(values, n)
     return np.array(values)

@@ -22,7 +22,7 @@ from tests.support.virtual_clock import VirtualClock, Waiter
 
 @dataclass(frozen=True)
 class Faults:
-    """How bad it gets. Probabilities are for each message; rates are per second for each link.
+    """Rates of faults. Probabilities are for each message; rates are per second for each link.
 
     Attributes:
         latency: mean time of a message on its way [s].
@@ -87,7 +87,7 @@ class Network:
     # --- messages
 
     def delay(self) -> float:
-        """Of one message [s]."""
+        """Delay of one message [s]."""
         faults, random = self.faults, self.random
         if faults.late and random.random() < faults.late:
             return random.uniform(0.0, faults.lateness)
@@ -118,7 +118,7 @@ class Network:
     # --- links
 
     def are_connected(self, a: FaultyBus, b: FaultyBus) -> bool:
-        """As both believe."""
+        """True while both believe that they are connected."""
         cut = self._cuts.get(_link(a, b))
         return a.is_alive and b.is_alive and (cut is None or cut.noticed > self.clock.monotonic())
 
@@ -191,7 +191,7 @@ class FaultyBus(Bus):
 
     @property
     def serves(self) -> bool:
-        """Whether it answers anything."""
+        """True while it answers anything."""
         return bool(self._services) and self.is_alive
 
     @property
@@ -200,7 +200,7 @@ class FaultyBus(Bus):
         return self._network
 
     def service(self, key: str) -> _Service | None:
-        """Of this participant for ``key``."""
+        """Service of this participant for ``key``."""
         return self._services.get(key)
 
     # --- Bus

@@ -29,7 +29,7 @@ CONNECTIONS = (("right.x", "left.u"), ("left.x", "right.u"))
 
 
 def description_of(name: str) -> SlaveDescription:
-    """What the slave ``name`` says of itself."""
+    """Description of the slave ``name``."""
     return SlaveDescription(
         model=name,
         kind="light",

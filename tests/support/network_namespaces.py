@@ -51,7 +51,7 @@ class Hosts:
     addresses: dict[str, str]
 
     def prefix(self, host: str) -> list[str]:
-        """What to put before a command to run it on ``host``."""
+        """Words before a command that run it on ``host``."""
         return ["ip", "netns", "exec", f"{self.mark}-{host}"]
 
     def cut(self, host: str) -> None:

@@ -367,7 +367,7 @@ class LocalError:
         return self.judged.estimate
 
     def deviation(self, *names: str) -> float:
-        """How far the estimates of some outputs are from the true errors, relative to these.
+        """Deviation of the estimates of some outputs from the true errors, relative to these.
 
         In the norm of all of them. A single one may be slower where its leading term happens to
         be small, and a displacement is one integration further from the inputs than a velocity,
@@ -439,7 +439,7 @@ be above rounding."""
 def limit_of_deviations(
     polynomial: InputPolynomial, factor: float, outputs: Sequence[str] = STATES, **options: Any
 ) -> tuple[float, float]:
-    """How far estimate and true error are from each other, at a small H and as H -> 0.
+    """Deviation of the estimate from the true error, at a small H and as H -> 0.
 
     After a history of steps of H / ``factor``. The deviation being of first order in H, its limit
     is found by extrapolation.

@@ -84,7 +84,7 @@ def connection(start: str, end: str, inner: str = "", attributes: str = "") -> s
 
 
 def system(elements: str, connections: str = "", before: str = "") -> str:
-    """What is in a system; ``before``: its connectors and parameter bindings."""
+    """Content of a system; ``before``: its connectors and parameter bindings."""
     return (
         f"{before}<ssd:Elements>{elements}</ssd:Elements>"
         f"<ssd:Connections>{connections}</ssd:Connections>"
@@ -163,11 +163,11 @@ class Packages:
         return path
 
     def read(self, description: str | bytes, **files: str | bytes | Path) -> ImportedSystem:
-        """What is read of a package."""
+        """System read from a package."""
         return self.read_file(self.write(description, **files))
 
     def read_file(self, path: Path, *, package_bus: bool = False) -> ImportedSystem:
-        """What is read of a file."""
+        """System read from a file."""
         scratch = self.folder / f"scratch-{len(list(self.folder.iterdir()))}"
         scratch.mkdir()
         return read_ssp(path, scratch, package_bus=package_bus)
@@ -180,7 +180,7 @@ class Packages:
 
 
 def tables(read: System) -> dict[str, Any]:
-    """What is set in a system, without the places of its models."""
+    """Settings of a system, without the places of its models."""
     dumped = read.model_dump()
     for table in dumped["slaves"].values():
         table["model"] = Path(table["model"]).name
@@ -201,7 +201,7 @@ def invoke(*arguments: object) -> str:
 
 @cache
 def described(model: Path) -> SlaveDescription:
-    """What a model says of itself."""
+    """Description of a model."""
     description: SlaveDescription = entry_points(group="doublestep.in_process")["describe"].load()(
         str(model), Path()
     )

@@ -57,7 +57,7 @@ class Trapped(_Chassis):
     )
 
     def prepare(self) -> None:
-        """As the chassis', if it lives to see the end of it."""
+        """Preparation as the chassis', if the accident lets it end."""
         super().prepare()
         self._meet(-1.0)
 

@@ -151,7 +151,7 @@ class Waiter:
 
 
 class VirtualTask:
-    """What `VirtualClock.start` started."""
+    """Task that `VirtualClock.start` started."""
 
     def __init__(self, clock: VirtualClock) -> None:
         self._clock = clock
@@ -221,7 +221,7 @@ class VirtualCondition:
         return self._waiters[-1].wait(timeout)
 
     def wait_for(self, predicate: Callable[[], object], timeout: float | None = None) -> bool:
-        """As `threading.Condition.wait_for`."""
+        """Waits like `threading.Condition.wait_for`."""
         end = None if timeout is None else self._clock.monotonic() + timeout
         while not predicate():
             left = None if end is None else end - self._clock.monotonic()

@@ -86,7 +86,7 @@ def decode(kind: Kind, number: int, data: bytes) -> str:
 
 @dataclass
 class Findings:
-    """What a number of messages showed.
+    """Findings of a number of messages.
 
     Attributes:
         messages: how many there were.

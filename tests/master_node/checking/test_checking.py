@@ -177,7 +177,7 @@ def test_inputs_from_outside_and_from_parameters(oscillator_dir: Path, tmp_path:
 
 
 def test_rules_of_slaves_bound_h(tmp_path: Path) -> None:
-    """Who gives the smallest and the largest H, and a grid, is named."""
+    """Slaves that give the smallest and the largest H, and a grid, are named."""
     system = (
         load_system(system_file(tmp_path))
         .with_slave("chassis", largest_step_size=0.05)
@@ -344,7 +344,7 @@ def test_a_served_slave_is_free_again(start: Start, tmp_path: Path, endpoint: st
 
 
 def test_warnings_are_not_lost_when_the_check_fails(caplog: pytest.LogCaptureFixture) -> None:
-    """What had been warned of before an error is logged after all; else it is in the report."""
+    """Warnings before an error are logged after all; else they are in the report."""
     log = logging.getLogger("master_node")
     with gathered_warnings() as warnings:
         log.warning("seen %d times", 2)
@@ -411,7 +411,7 @@ def test_loops_are_marked() -> None:
 
 
 def test_names_of_others_are_text_in_graphs() -> None:
-    """What a model calls itself ends no quotation, and is no markup."""
+    """Names that models give themselves end no quotation, and are no markup."""
     report = report_of(gains(0.5))
     (slave,) = report.slaves
     evil = '"] ; click s0 "javascript:x" <b>\\'

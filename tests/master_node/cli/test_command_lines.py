@@ -1,4 +1,4 @@
-"""What a stranger meets first: versions, help, completion, one model alone, names of models."""
+"""First contact of a user: versions, help, completion, one model alone, names of models."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def test_the_main_thread_is_interrupted_in_mid_wait() -> None:
 def test_an_fmu_alone_runs_its_default_experiment(
     capability_dir: Path, tmp_path: Path, command: MainCommand
 ) -> None:
-    """The same bits as the system that says all of it, at the points of its own step size."""
+    """An FMU alone gives the bits of the system that says all of it, on its own step size."""
     fmu = capability_dir / "plain_lag.fmu"
     code, text = command("run", fmu, "--output", tmp_path / "alone", "--in-process")
     assert code == 0, text

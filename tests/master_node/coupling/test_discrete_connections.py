@@ -41,7 +41,7 @@ def switched_lag(times: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("estimator", ["mod", "rich"])
 def test_discrete_outputs_switch_other_slaves(capability_dir: Path, estimator: str) -> None:
-    """What a change does to continuous variables is within the tolerance, and each is an event."""
+    """Effects of a change on continuous variables are within the tolerance; each is an event."""
     result = simulate(clock_and_device(capability_dir), in_process=True, estimator=estimator)
     error = np.abs(result["device.real_continuous_out"] - switched_lag(result.time))
     assert error.max() < 1e-3
@@ -233,7 +233,7 @@ def mapped(folder: Path, source: str, target: str, mapping: dict[Any, Any], **mo
 
 
 def test_values_are_mapped_by_a_table(capability_dir: Path) -> None:
-    """What has an entry becomes its target, all else is handed on as it is."""
+    """Values with an entry become its target, all others are handed on unchanged."""
     ends = ("clock.counter_out", "device.integer_in")
     result = simulate(mapped(capability_dir, *ends, {0: 10, 2: -7}), in_process=True)
     table = np.array([10, 1, -7, 3, 4])

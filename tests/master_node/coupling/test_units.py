@@ -57,6 +57,6 @@ def test_different_dimensions_are_named() -> None:
 
 
 def test_names_that_say_nothing_are_told_apart_from_equal_ones() -> None:
-    """Who has no definition is named."""
+    """Units without a definition are named."""
     with pytest.raises(UnknownUnitError, match="bar not defined"):
         conversion("bar", {}, "m", UNITS)

@@ -86,7 +86,7 @@ def attempted(kind: str, base: Path = Path(), **inputs: Any) -> tuple[Run, Switc
 
 
 def driven(kind: str, **inputs: Any) -> tuple[Result, Switched]:
-    """The same, if nothing went wrong."""
+    """Result and slave of a run as by `attempted`; raises its error."""
     run, slave = attempted(kind, **inputs)
     if run.error is not None:
         raise run.error
@@ -151,7 +151,7 @@ def test_functions_are_asked_at_communication_points(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["mod", "rich"])
 def test_undeclared_changes_of_functions_are_searched(kind: str) -> None:
-    """As those of discrete outputs are, until their delay is within the tolerance."""
+    """Undeclared changes are searched, as of discrete outputs, until within the tolerance."""
     result, _ = driven(kind, level=lambda t: 3 if t >= 0.7 else 1)
     error = result["slave.x"] - motion(result.time, (0.0, 0.7), (1, 3))
     assert np.abs(error).max() < 1e-3

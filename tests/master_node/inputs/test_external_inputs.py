@@ -350,7 +350,7 @@ def test_a_jump_within_the_tolerance_is_none() -> None:
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_two_rows_of_one_time_are_a_jump_of_a_linear_table(estimator: str) -> None:
-    """As in Modelica's tables."""
+    """Two rows of one time are a jump, as in Modelica's tables."""
     rows = ([0.0, 1.1, 1.1, STOP], [0.0, 1.0, -1.0, 0.0])
     result = driven(rows, estimator=estimator)
     assert 1.1 in result.time
@@ -516,7 +516,7 @@ def test_connected_and_external_inputs_of_one_slave(
 
 
 def with_models(system: System, folder: Path) -> System:
-    """The same system with the FMUs in a folder."""
+    """``system`` with its FMUs in ``folder``."""
     slaves = {
         name: slave.model_copy(update={"model": str(folder / Path(str(slave.model)).name)})
         for name, slave in system.slaves.items()
@@ -573,7 +573,7 @@ def test_in_process_and_over_zenoh_the_same_bits(
 
 
 def test_a_python_model_takes_what_an_exact_slave_takes() -> None:
-    """The same signal, once more from a function by name, against the same reference."""
+    """A function by name drives a Python model to the reference of the exact slave."""
     system = System(
         simulation={"stop_time": STOP, "slave_tolerance": 1e-10},
         slaves={"oscillator": {"model": MODEL}},

@@ -559,7 +559,7 @@ class Interrupts:
 
 @pytest.mark.parametrize("without", [("wheel",), ("chassis", "wheel")])
 def test_an_interrupted_run_keeps_its_results(without: Collection[str]) -> None:
-    """What was accepted stays."""
+    """Accepted steps stay in the results."""
     run = run_slaves(car(order="auto"), mixed_car(without), [Interrupts()])
     assert isinstance(run.error, InterruptedRunError)
     assert run.result.summary["outcome"] == "interrupted"

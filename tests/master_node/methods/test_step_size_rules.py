@@ -201,7 +201,7 @@ def test_rounding_makes_no_gap(begin: float, smallest: float, number: int, ratio
 
 
 def test_what_no_double_steps_fill_is_told() -> None:
-    """Of 3 to 4 ms each: 4.5 ms between an event and the stop time have none, 5.9 ms before one."""
+    """Double steps of 3 to 4 ms fill neither 4.5 ms behind an event nor 5.9 ms before one."""
     limits = {"smallest_step_size": 1.5e-3, "largest_step_size": 2e-3}
     for setting in ({"stop_time": 0.086}, {"events": (0.0074,)}):
         with pytest.raises(ConfigurationError, match=r"there are no double steps of two times"):

@@ -170,7 +170,7 @@ def test_dense_output_is_as_good_as_the_solution(fmu_dir: Path, order: int, poin
 
 
 def test_dense_output_does_not_depend_on_the_grid(fmu_dir: Path) -> None:
-    """The same communication points and the same values at common times, bit for bit."""
+    """Grids change neither the communication points nor values at common times, bit for bit."""
     system = load_system(EXAMPLES / "displacement.toml")
     fine = simulate(system, in_process=True, stop_time=1.0, output_interval=0.0625)
     coarse = simulate(system, in_process=True, stop_time=1.0, output_interval=0.125)

@@ -461,7 +461,7 @@ def test_steps_end_exactly_on_the_stop_time(start: float, duration: float, part:
 def test_steps_of_any_size_end_exactly_on_the_stop_time(
     start: float, duration: float, parts: list[float]
 ) -> None:
-    """The same when H changes from step to step, as it does under control."""
+    """The last step ends exactly on the stop time, also when H changes from step to step."""
     stop = start + duration
     assume(stop > start)
     steps = double_steps(start, stop, lambda n: parts[n % len(parts)] * duration)
@@ -473,7 +473,7 @@ def test_steps_of_any_size_end_exactly_on_the_stop_time(
 def test_the_last_double_step_is_not_arbitrarily_small(
     start: float, duration: float, part: float
 ) -> None:
-    """What is left for less than two double steps is shared: none is below half of H."""
+    """A rest of less than two double steps is shared: none is below half of H."""
     stop = start + duration
     assume(stop > start)
     h = part * duration

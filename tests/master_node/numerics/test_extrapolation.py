@@ -49,14 +49,14 @@ def inputs(draw: st.DrawFn, degree: int, span: float) -> Polynomial:
 
 
 def sizes(polynomial: Polynomial, reach: float) -> float:
-    """How large the terms of a polynomial get up to ``reach`` [s]."""
+    """Sum of the largest sizes of a polynomial's terms up to ``reach`` [s]."""
     return float(sum(abs(c) * reach**j for j, c in enumerate(polynomial.coef)))
 
 
 def signal_of(
     offsets: Sequence[float], values: Sequence[np.ndarray], slopes: Sequence[np.ndarray] = ()
 ) -> InputSignal:
-    """What goes over the wire for some points."""
+    """Signal that goes over the wire for some points."""
     return InputSignal(interpolate(offsets, values, slopes))
 
 
@@ -157,7 +157,7 @@ def test_rows_are_the_derivatives(data: st.DataObject, wanted: InputPolynomial) 
 
 @given(st.data(), polynomials)
 def test_all_conditions_are_met(data: st.DataObject, wanted: InputPolynomial) -> None:
-    """Of any points, not only those of a polynomial: values, and derivatives where they are."""
+    """Polynomials meet all values, and derivatives where given, of any points."""
     grid = data.draw(grids(wanted.points))
     span = abs(grid[-1]) or 1.0
     u = [np.array([data.draw(values)]) for _ in grid]
@@ -199,7 +199,7 @@ def test_constants_have_derivatives_of_exactly_zero(
 
 @given(st.data(), st.integers(0, 4))
 def test_divided_differences_of_a_monomial(data: st.DataObject, degree: int) -> None:
-    """Of t^j over j + 1 points it is 1, over more points 0; repeated nodes take the derivative."""
+    """Divided differences of t^j are 1 over j + 1 points, 0 over more, also at repeated nodes."""
     grid = data.draw(grids(degree + 1))
     span = abs(grid[-1]) or 1.0
     unit = [s / span for s in grid]
@@ -247,7 +247,7 @@ def made(times: Sequence[float], table: np.ndarray) -> CouplingHistory:
 
 
 def table(history: CouplingHistory) -> np.ndarray:
-    """What a history holds, shape (points, rows, n)."""
+    """Content of a history, shape (points, rows, n)."""
     return np.array(history.inputs)
 
 

@@ -146,7 +146,7 @@ def test_magnitudes_are_those_of_the_derivatives(
 
 
 def do_steps(path: Path, **simulation: object) -> int:
-    """Of each slave in a run."""
+    """Largest number of do_step calls of a slave in a run."""
     result = simulate(load_system(path), in_process=True, coupling="explicit", **simulation)
     return int(max(result.summary["do_steps"].values()))
 

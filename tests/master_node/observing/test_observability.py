@@ -1,4 +1,4 @@
-"""What a run shows while it goes on: structured logs, metrics, traces, and who is slow."""
+"""Views of a run while it goes on: structured logs, metrics, traces, and slow slaves."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_text_is_as_it_was(restored_logging: None, capsys: pytest.CaptureFixture
 def test_libraries_are_heard_when_they_warn(
     restored_logging: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What they do is not told, such as that a list of fonts was made."""
+    """Messages of libraries below a warning are not told, such as of a list of fonts."""
     configure_logs(LogFormat.TEXT, "%(levelname)s: %(message)s")
     for name in ("matplotlib.font_manager", "master_node", "slave_node.fmu", "protocol"):
         logging.getLogger(name).info("of %s", name)
@@ -393,7 +393,7 @@ def is_within(inner: dict[str, Any], outer: dict[str, Any]) -> bool:
 
 
 def assert_within(inner: dict[str, Any], outer: dict[str, Any]) -> None:
-    """The same."""
+    """Asserts that one span is within another."""
     assert is_within(inner, outer), (inner, outer)
 
 
@@ -463,7 +463,7 @@ class _Link:
 
 
 def test_time_is_split_into_computing_and_the_way() -> None:
-    """What a request took beyond the slave's own time is transport, and never negative."""
+    """Time of a request beyond the slave's own is transport, and never negative."""
     group = SlaveGroup({"a": _Link(0.05, 0.03), "b": _Link(0.0, 5.0)})  # type: ignore[dict-item]
     group.execute([(GetState(0),)] * 2)
     a, b = group.statistics["a"], group.statistics["b"]

@@ -105,7 +105,7 @@ def test_redraws_are_rare_however_many_attempts(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.skipif(sys.platform == "win32", reason="closed pipes are told by EPIPE on POSIX")
 def test_a_closed_pipe_does_not_end_the_run() -> None:
-    """Nobody reads standard error any more: the run goes on, and standard output still works."""
+    """A closed standard error stops no run, and standard output still works."""
     reading, writing = os.pipe()
     os.close(reading)
     code = """
@@ -139,7 +139,7 @@ def printed(summary: dict[str, object]) -> str:
 
 
 def test_summary_table_has_run_and_slaves() -> None:
-    """What happened, how long it took, and where; brackets in names are no markup."""
+    """The table tells what happened, how long and where; brackets in names are no markup."""
     settings = {"simulation": {"estimator": "richardson", "order": 2}}
     lines = [line.split() for line in printed(summarize(START, END, settings)).splitlines()]
     assert ["outcome", "completed"] in lines

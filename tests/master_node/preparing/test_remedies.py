@@ -1,4 +1,4 @@
-"""What the master does about what trial steps show: before the run, named, no more than that."""
+"""Remedies of the master for findings of trial steps: before the run, named, no more."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class Workshop:
         return with_substeps(slave, configuration)
 
     def prepare(self) -> Prepared:
-        """As a run does it."""
+        """Prepares a system as a run does."""
         loaded = {name: link.description for name, link in self.executors.items()}
         descriptions = configure(self.links, self.system, loaded)
         return prepare(self.group, self.system, descriptions, {})
@@ -264,7 +264,7 @@ def test_a_clock_that_does_not_fit_the_run_is_only_reported() -> None:
 
 
 def test_one_euler_step_per_do_step_is_split_into_substeps() -> None:
-    """As short as the trial steps showed, rounded down to two digits."""
+    """Substeps are as short as the trial steps showed, rounded down to two digits."""
     workshop = Workshop({"native": EulerSlave})
     prepared = workshop.prepare()
     largest = workshop.loaded[-1].largest_substep
@@ -455,7 +455,7 @@ def test_a_clock_too_slow_for_the_tolerance_is_said_so(capability_dir: Path) -> 
 
 
 def test_euler_steps_are_invisible_to_est_mod_and_made_short_enough(capability_dir: Path) -> None:
-    """The same communication steps, and a smaller error."""
+    """Shorter Euler steps give equal communication steps and a smaller error."""
     error, summary = lag_error(lags(capability_dir, "euler_per_step"))
     blind, blind_summary = lag_error(lags(capability_dir, "euler_per_step", examine=False))
     assert error < 0.3 * blind

@@ -65,7 +65,7 @@ def test_the_best_that_model_and_host_allow_or_what_is_asked_for(
 def test_what_cannot_be_is_refused(
     description: SlaveDescription, wanted: str, *, can_fork: bool, message: str
 ) -> None:
-    """As an error of the configuration, before anything runs."""
+    """Impossible ways to save states are errors of the configuration, before anything runs."""
     with pytest.raises(ModelError, match=message):
         choose(description, wanted, can_fork=can_fork)
 
@@ -122,14 +122,14 @@ def test_a_state_that_is_not_to_be_saved_is_not(fmu_dir: Path) -> None:
 
 
 def executor(model: Path, tmp_path: Path, **options: str) -> Executor:
-    """As a worker has it."""
+    """Executor of a model, as a worker has it."""
     loaded_executor = load_executor(str(model), Path(), "x", tmp_path, **options)
     assert isinstance(loaded_executor, Executor)
     return loaded_executor
 
 
 def kind_of(executor: Executor) -> str:
-    """What the slave says."""
+    """Kind of saved states that the slave declares."""
     (description,) = executor.execute([Describe()]).results
     assert isinstance(description, SlaveDescription)
     return description.state_kind

@@ -42,7 +42,7 @@ def grid(n: int, function: Callable[[float], float]) -> Columns:
 
 
 def test_equal_files_are_equal_in_bits(write: Write) -> None:
-    """The same numbers, NaN and inf included: no difference at any tolerance."""
+    """Files with equal numbers, NaN and inf included, have no difference at any tolerance."""
     columns = {"time": [0.0, 1.0, 2.0], "s.x": [math.nan, math.inf, 1e-310]}
     comparison = compare(write("a", columns), write("b", columns), 0.0, 0.0)
     assert comparison.equal_bits

@@ -46,7 +46,7 @@ def make_result(
 
 
 def labels(figure: Figure) -> list[str]:
-    """What the panels show, from top to bottom."""
+    """Labels of the panels, from top to bottom."""
     return [axes.get_ylabel() for axes in figure.axes]
 
 
@@ -200,7 +200,7 @@ def test_any_name_draws(tmp_path: Path) -> None:
 
 
 def test_large_results_are_decimated_without_losing_peaks() -> None:
-    """Of a million rows some thousand are drawn, the one with the peak among them."""
+    """Some thousand of a million rows are drawn, the one with the peak among them."""
     n = 1_000_000
     time = np.linspace(0.0, 1.0, n) ** 3  # most points where time is small
     values = np.sin(20.0 * time)

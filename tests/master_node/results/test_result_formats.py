@@ -236,7 +236,7 @@ def test_the_summary_names_the_formats_and_what_mat_cannot_hold(tmp_path: Path) 
 
 
 def test_the_text_of_discrete_values(tmp_path: Path) -> None:
-    """As documented: repr, digits, true and false, quotation marks, base64."""
+    """Texts of discrete values are as documented: repr, digits, true, quotation marks, base64."""
     point = Point(0.25, np.array([1.0, 2.0]), (2.0, -7, True, 'say "x", y', b"\xff\x00"))
     lines = (write(tmp_path, [point], "csv") / "results.csv").read_text().splitlines()
     assert lines == [
@@ -544,12 +544,12 @@ def test_full_disk_leaves_whole_batches(
 
 
 def matrices(path: Path) -> dict[str, Any]:
-    """As SciPy reads them, characters one by one."""
+    """Matrices as SciPy reads them, characters one by one."""
     return dict(loadmat(path, chars_as_strings=False))
 
 
 def transposed_texts(characters: np.ndarray) -> list[str]:
-    """As DyMat and OpenModelica read names: a column of characters each."""
+    """Texts as DyMat and OpenModelica read names: a column of characters each."""
     return ["".join(column).rstrip() for column in zip(*characters, strict=True)]
 
 

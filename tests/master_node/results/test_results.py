@@ -452,7 +452,7 @@ def test_directory_in_place_of_a_file_is_refused(tmp_path: Path) -> None:
 
 
 def test_lost_directory_is_an_error_at_the_end(tmp_path: Path) -> None:
-    """What could not be written is said, even when it is only the summary."""
+    """Unwritten files are told, even when it is only the summary."""
     writer = ResultsWriter(tmp_path / "out", {})
     writer.started(start())
     (tmp_path / "out").rename(tmp_path / "moved")
@@ -490,7 +490,7 @@ def test_end_without_a_start_writes_nothing(tmp_path: Path) -> None:
 
 
 def test_recording_equals_what_is_written(tmp_path: Path) -> None:
-    """The same run in memory and through the files gives the same numbers and the same summary."""
+    """A run in memory has the numbers and the summary of one through files."""
     recording = Recording(SETTINGS)
     drive(recording)
     recorded, loaded = recording.result(), Result.load(write(tmp_path))

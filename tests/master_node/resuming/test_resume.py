@@ -116,7 +116,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
 
 @pytest.mark.parametrize("which", ["wheel", "both"])
 def test_slaves_without_rollback(which: str, tmp_path: Path, capability_dir: Path) -> None:
-    """What cannot be saved is replayed from T_0: mixed runs, and runs where none can go back."""
+    """Slaves that cannot be saved are replayed from T_0, in mixed runs and all together."""
     names = {"wheel": ("wheel",), "both": ("chassis", "wheel")}[which]
     models = {name: capability_dir / f"{name}_no_state.fmu" for name in names}
     system = car(tmp_path, "stop_time = 0.5\n", **models)
@@ -266,7 +266,7 @@ def test_results_that_were_not_completed(
 
 
 def assert_complete(out: Path, whole: Path) -> None:
-    """The same files, and the same in them."""
+    """Asserts that two directories hold equal files with equal content."""
     assert {p.name for p in out.iterdir()} == {p.name for p in whole.iterdir()}
     names = [p.name for p in whole.iterdir() if p.suffix in (".csv", ".parquet", ".mat")]
     assert {name: (out / name).read_bytes() for name in names} == {
@@ -443,7 +443,7 @@ def test_no_checkpoint_was_wanted(tmp_path: Path) -> None:
 
 
 def test_a_new_run_replaces_the_checkpoint(tmp_path: Path) -> None:
-    """What is resumed is the last run in a directory, not one before it."""
+    """Resuming continues the last run in a directory, not one before it."""
     out = broken_off(tmp_path)
     system = load_system(tmp_path / "car.toml").with_simulation(stop_time=0.2)
     simulate(system, output=out, in_process=True)
@@ -453,7 +453,7 @@ def test_a_new_run_replaces_the_checkpoint(tmp_path: Path) -> None:
 
 
 def test_a_new_run_without_checkpoints_leaves_none_of_an_old_one(tmp_path: Path) -> None:
-    """What would be resumed is another run than that of the results beside it."""
+    """An old checkpoint beside new results would resume another run than theirs."""
     out = broken_off(tmp_path)
     system = load_system(tmp_path / "car.toml").with_simulation(
         checkpoint_interval=0.0, relative_tolerance=1e-6

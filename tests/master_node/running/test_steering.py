@@ -249,7 +249,7 @@ def test_what_is_set_holds_from_there_on(
 
 
 def test_branches_with_other_parameters(capability_dir: Path) -> None:
-    """What was set belongs to the branch: a mark brings back the values that held there."""
+    """Values set in a branch belong to it: a mark brings back the values that held there."""
     with open_run(drive(capability_dir), in_process=True) as run:
         run.set({"drive.u": 1.0, "drive.gain": 1.0})
         run.until(0.5)
@@ -372,7 +372,7 @@ def test_mistakes_name_variable_and_remedy(capability_dir: Path) -> None:
 
 
 def test_a_driven_input_is_not_set(capability_dir: Path) -> None:
-    """What the table of inputs drives is left to it."""
+    """Inputs that the table of inputs drives are left to it."""
     table = InputSettings(table=((0.0, 1.0), (0.0, 1.0)))
     system = System(
         simulation={"stop_time": 1.0},
@@ -407,7 +407,7 @@ def test_a_session_that_is_left_early_is_stopped_and_resumed(tmp_path: Path) -> 
 def test_changes_and_branches_are_resumed(
     capability_dir: Path, tmp_path: Path, slave: Mapping[str, Any]
 ) -> None:
-    """What was set and overridden before a run was broken off holds when it goes on."""
+    """Values set and overridden before a run was broken off hold when it goes on."""
 
     def steered(folder: Path, stop: float) -> None:
         system = drive(capability_dir, **slave)

@@ -59,7 +59,7 @@ def completed(system: System, slaves: dict[str, Slave] | None = None) -> Result:
 
 
 def force_of(result: Result) -> np.ndarray:
-    """What the force is with the positions and velocities at the communication points."""
+    """Force for the positions and velocities at the communication points."""
     stretch = result["wheel.x"] - result["chassis.x"]
     rate = result["wheel.v"] - result["chassis.v"]
     return np.asarray(K_C * stretch + D_C * rate)

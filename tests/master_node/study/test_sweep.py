@@ -420,7 +420,7 @@ class Done:
 
 
 def run_python(script: str) -> str:
-    """What a script prints, in a process of its own."""
+    """Output of a script in a process of its own."""
     import textwrap  # noqa: PLC0415  here only
 
     words = [sys.executable, "-c", textwrap.dedent(script)]
@@ -666,7 +666,7 @@ needs = ["solver", "other"]
 def test_ctrl_c_ends_a_sweep_at_once_and_it_can_go_on(
     start: Callable[..., Command], tmp_path: Path, in_process: bool
 ) -> None:
-    """What had ended stays and is not run again; of the rest nothing is left, no process either.
+    """Runs that had ended stay and are not run again; no file or process is left of the rest.
 
     Before that, no more runs are under way than there are licences, though there are workers, and
     a second sweep is not let into the directory.
@@ -847,7 +847,7 @@ def test_what_a_cluster_lacks_is_said(cluster: Any, tmp_path: Path) -> None:
 
 
 def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """What to install."""
+    """The error names the extra to install."""
     car(tmp_path)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     done = sweep(study_file(tmp_path, GRID), tmp_path / "out", "--dask", "x")

@@ -49,7 +49,7 @@ def start(tmp_path: Path) -> Iterator[Commands]:
 
 
 def slave_status(name: str, instance: str = "0", **values: Any) -> SlaveStatus:
-    """What a slave would say."""
+    """Status as a slave would tell it."""
     status = SlaveStatus(
         name=name,
         instance=instance,
@@ -92,7 +92,7 @@ def serve(bus: Bus, status: SlaveStatus, answer: Callable[[], bytes] | None = No
     ],
 )
 def test_a_status_gets_there_and_back(status: Any) -> None:
-    """As it was, without what a later version may add, and never with a value of another type."""
+    """A status arrives unchanged, without additions of later versions or values of other types."""
     message = decode_map(encode_map({**status.to_message(), "later": "more"}))
     assert type(status).from_message(message) == status
     for name in message.keys() - {"later"}:

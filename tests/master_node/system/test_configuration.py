@@ -64,12 +64,12 @@ def simulation(line: str) -> str:
 
 
 def wheel(line: str) -> str:
-    """The same for ``[slaves.wheel]``."""
+    """Text of a system file with keys in ``[slaves.wheel]``."""
     return SYSTEM.replace('model = "wheel.fmu"', f'model = "wheel.fmu"\n{line}')
 
 
 def bus(line: str) -> str:
-    """The same with a ``[bus]`` table."""
+    """Text of a system file with a ``[bus]`` table."""
     return f"{SYSTEM}\n[bus]\n{line}\n"
 
 
@@ -312,7 +312,7 @@ def test_overrides_change_what_they_name_and_nothing_else(tmp_path: Path) -> Non
 
 
 def test_derived_defaults_follow_an_override(tmp_path: Path) -> None:
-    """What the file does not give depends on the overridden values, not on the old ones."""
+    """Defaults follow the overridden values, not those of the file."""
     system = load_system(written(tmp_path, SYSTEM))
     shorter = system.with_simulation(stop_time=0.4, relative_tolerance=1e-2).simulation
     assert shorter.step_size == pytest.approx(0.4e-3)
@@ -320,7 +320,7 @@ def test_derived_defaults_follow_an_override(tmp_path: Path) -> None:
 
 
 def test_a_wrong_override_is_refused_like_a_wrong_file(tmp_path: Path) -> None:
-    """The same checks, with the same words."""
+    """Overrides meet the checks of a file, with the same words."""
     system = load_system(written(tmp_path, SYSTEM))
     with pytest.raises(ConfigurationError, match=r"car\.toml: \[simulation\] .*after start_time"):
         system.with_simulation(start_time=4.0)
@@ -341,7 +341,7 @@ def test_bus_overrides(tmp_path: Path) -> None:
 
 
 def test_results_overrides(tmp_path: Path) -> None:
-    """What was not given leaves the file's settings."""
+    """Keys that were not given leave the file's settings."""
     text = f"{SYSTEM}\n[results]\nvariables = ['wheel.*']\nevery = 5\n"
     system = load_system(written(tmp_path, text))
     changed = system.with_results(variables=(), every=None, formats=("mat",))

@@ -162,7 +162,7 @@ def test_outputs_that_are_not_continuous_and_real_take_no_part() -> None:
 
 
 def test_the_nearest_tolerance_counts_and_nominals_scale_the_absolute_one() -> None:
-    """Of the variable, else of its slave, else of the simulation; ATOL times the nominal value."""
+    """Tolerances are the variable's, else the slave's, else the run's; ATOL times the nominal."""
     descriptions = {
         "a": described("", "x", Variable("F", OUTPUT, nominal=1e3)),
         "b": described("", "x y", Variable("F", OUTPUT, nominal=1e3)),

@@ -1,4 +1,4 @@
-"""What both buses promise, and what only a real network can show."""
+"""Promises of both buses, and what only a real network can show."""
 
 from __future__ import annotations
 

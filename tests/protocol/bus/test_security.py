@@ -1,4 +1,4 @@
-"""Who gets onto the bus with certificates, who does not and is told why, and what each may do."""
+"""Certificates: they admit to the bus or say why not, and decide what each peer may do."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def strangers(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same of another authority."""
+    """Certificates of another authority."""
     folder = tmp_path_factory.mktemp("strangers")
     make_certificates(folder, [Host.parse("here")], ROLES, 30)
     return folder / "here"
@@ -176,7 +176,7 @@ def test_certificates_that_cannot_be_used_are_named(
 def test_why_a_connection_does_not_come_about(
     open_bus: OpenBus, laboratory: Path, strangers: Path, endpoint: str
 ) -> None:
-    """Nobody there, another authority, another name, and a host that does not speak TLS."""
+    """Reasons told: no listener, another authority, another name, a host without TLS."""
     secure = endpoint.replace("tcp/", "tls/")
     ours = Credentials(laboratory, Role.SLAVE)
     assert probe(secure, ours, 1.0).reach is Reach.NOT_REACHED
@@ -390,7 +390,7 @@ def serve_status(bus: Bus, key: SlaveKey) -> None:
 
 
 def ask(bus: Bus, key: SlaveKey) -> bytes | None:
-    """What a slave answers; None when it does not."""
+    """Answer of a slave; None when there is none."""
     try:
         return bus.caller(key.verb(STATUS), 2.0).request(b"")
     except SlaveLostError:

@@ -41,7 +41,7 @@ DEFLATE, BZIP2, LZMA, IMPLODE = 8, 12, 14, 6
 
 
 class Entry(NamedTuple):
-    """What an archive says of an entry, and what is there."""
+    """Entry of an archive: its declared sizes, and its content."""
 
     name: str
     method: int
@@ -99,18 +99,18 @@ def in_little_memory() -> Iterator[None]:
 
 
 def inspect(path: Path) -> None:
-    """What ``slave-node inspect``, ``validate`` and ``serve`` begin with."""
+    """First step of ``slave-node inspect``, ``validate`` and ``serve``."""
     describe_model(path.name, path.parent)
 
 
 def run(path: Path) -> None:
-    """What ``master-node run`` begins with."""
+    """First step of ``master-node run``."""
     with open_system(path):
         pass
 
 
 def convert(path: Path) -> None:
-    """What ``master-node import`` does."""
+    """Work of ``master-node import``."""
     import_system(path, path.with_suffix(".toml"))
 
 

@@ -277,7 +277,7 @@ def master_run(world: World) -> str:
 
 
 def master_check(world: World) -> str:
-    """What an FMU says of itself, in the report, as data and in the graph; a model that fails."""
+    """Texts of an FMU in the report, as data and in the graph; a model that fails."""
     text = '[simulation]\nstop_time = 1.0\nexamine = false\n[slaves.wheel]\nmodel = "evil.fmu"\n'
     world.hostile_fmu()
     file = world.write("evil.toml", text)

@@ -232,7 +232,7 @@ errors = st.builds(
 
 
 def results_of(call: Call) -> st.SearchStrategy[object]:  # noqa: PLR0911
-    """What a slave can answer to ``call``."""
+    """Results that a slave can give to ``call``."""
     match call:
         case GetOutputs():
             return arrays()
@@ -425,7 +425,7 @@ def test_an_error_of_another_version_is_a_protocol_error() -> None:
     )
 )
 def test_an_error_reply_of_any_shape_is_an_error(reply: dict[str, Any]) -> None:
-    """What a stranger fills in wrongly is left out; the rest can be shown."""
+    """Wrong fields of a stranger's error are left out; the rest can be shown."""
     error = DoublestepError.from_reply(reply)
     assert isinstance(str(error), str)
     assert decode_reply([], encode_error(error)).error is not None
@@ -499,7 +499,7 @@ def test_random_bytes_raise_nothing_strange(data: bytes) -> None:
 def test_damaged_messages_raise_nothing_strange(
     data: bytes, changes: list[tuple[float, bytes, int]]
 ) -> None:
-    """The same for messages with bytes put in, taken out and replaced."""
+    """Messages with bytes put in, taken out and replaced are taken or refused."""
     for place, inserted, removed in changes:
         at = int(place * len(data))
         data = data[:at] + inserted + data[at + removed :]
@@ -637,7 +637,7 @@ def test_ill_formed_arrays_are_refused_with_the_reason(array: Any, message: str)
 
 
 def test_equal_shapes_share_nothing_that_can_change() -> None:
-    """What is remembered of a shape is not what a caller gets: each message has its own numbers."""
+    """Remembered shapes are not handed to callers: each message has its own numbers."""
     first, second = (
         decode_program(encode_program([SetInputs(np.full((1, 2), x)), DoStep(x, 1.0), GetState(1)]))
         for x in (1.0, 2.0)

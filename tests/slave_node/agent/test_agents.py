@@ -94,7 +94,7 @@ def start(tmp_path: Path) -> Iterator[Commands]:
 
 @pytest.fixture
 def models(tmp_path: Path, fmu_dir: Path) -> Path:
-    """What an agent may start: chassis and wheel."""
+    """Models that an agent may start: chassis and wheel."""
     folder = tmp_path / "models"
     folder.mkdir()
     for name in ("chassis.fmu", "wheel.fmu"):
@@ -526,7 +526,7 @@ def test_a_model_is_sent_again_whose_upload_others_displaced(
 
 
 def test_a_cache_for_others_is_refused_and_old_pieces_go(tmp_path: Path) -> None:
-    """Who can write there could choose what is loaded; what a killed agent left is removed."""
+    """Writers of a cache could choose what is loaded; pieces of a killed agent are removed."""
     folder = tmp_path / "cache"
     UploadCache(folder, MB, MB)
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -915,7 +915,7 @@ def test_which_agent_is_taken() -> None:
 
 
 def test_an_upload_outlives_a_lost_connection(tmp_path: Path) -> None:
-    """What was sent is not sent again, and the model that arrives is the one from here."""
+    """Pieces that arrived are not sent again, and the model that arrives is the one from here."""
     bus = InProcessBus()
     cache = UploadCache(tmp_path / "cache", 10 * MB, 10 * MB)
     status = replace(STATUS, licences=(), upload_limit=10 * MB)

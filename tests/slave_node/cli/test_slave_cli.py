@@ -294,7 +294,7 @@ def test_a_killed_node_leaves_no_worker_in_a_step(endless: Node) -> None:
 
 
 def test_it_ends_while_the_model_is_loading(start: Start, tmp_path: Path) -> None:
-    """Who changes his mind need not wait for a model that takes its time."""
+    """A signal ends the node while a model takes its time to load."""
     begun = tmp_path / "begun"
     os.mkfifo(begun)
     models = tmp_path / "models.py"
@@ -317,7 +317,7 @@ def test_it_ends_while_the_model_is_loading(start: Start, tmp_path: Path) -> Non
 
 
 def failure(node: Node) -> str:
-    """What it says when it ends with code 2: one line."""
+    """Line of a node that ends with code 2."""
     code, _ = node.ended()
     assert code == 2, node.log
     (line,) = [line for line in node.log if line.startswith("slave-node: ")]
@@ -386,7 +386,7 @@ def test_a_second_slave_of_a_name_is_refused(start: Start, fmu_dir: Path, endpoi
 
 
 def inspect(*arguments: str, code: int = 0) -> str:
-    """What ``slave-node inspect`` prints."""
+    """Output of ``slave-node inspect``."""
     result = subprocess.run(
         [sys.executable, "-m", "slave_node", "inspect", *arguments],
         capture_output=True,

@@ -132,7 +132,7 @@ def test_direct_dependencies_are_read(capability_dir: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("half", INPUTS)
 def test_the_version_of_fmi_makes_no_difference(load: Load, half: str) -> None:
-    """The same equations with held inputs and the FMU's own tolerance: the same bits as FMI 2.0."""
+    """Held inputs and the FMU's own tolerance give the bits of FMI 2.0."""
     expected = march(started(load(f"{half}_bare"), inputs=INPUTS[half]))
     assert march(started(load(f"{half}_fmi1"), inputs=INPUTS[half])) == expected
 
@@ -189,7 +189,7 @@ def test_an_output_without_start_value_is_asked_for(
 def test_a_negated_alias_has_the_other_sign(
     capability_dir: Path, tmp_path: Path, load: Load
 ) -> None:
-    """As input, as output, and as start value."""
+    """A negated alias has the other sign as input, as output, and as start value."""
     text = zipfile.ZipFile(capability_dir / "wheel_fmi1.fmu").read("modelDescription.xml").decode()
     references = {
         name: text[text.index(f'name="{name}" valueReference="') :].split('"')[3]
@@ -301,7 +301,7 @@ def test_there_is_no_way_back(load: Load) -> None:
 def test_errors_come_with_the_words_of_the_fmu(
     load: Load, capability_dir: Path, tmp_path: Path
 ) -> None:
-    """Of a step, of a start value, and of an instantiation that fails."""
+    """Errors of a step, a start value and an instantiation have the words of the FMU."""
     one, two = started(load("wheel_fmi1")), started(load("wheel_fmi1"))
     with pytest.raises(StepRejectedError, match=r"fmiDoStep returned fmiError; the FMU's log: .*0"):
         one.do_step(0.5, 0.1, False)

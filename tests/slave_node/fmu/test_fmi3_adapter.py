@@ -112,7 +112,7 @@ def march(slave: Slave, begin: float = 0.0, order: int = 0, output_order: int = 
 
 @pytest.mark.parametrize("half", CONTINUOUS)
 def test_the_version_of_fmi_makes_no_difference(load: Load, half: str) -> None:
-    """The same equations with held inputs give the same bits in FMI 2.0 and 3.0."""
+    """Equal equations with held inputs give equal bits in FMI 2.0 and 3.0."""
     expected = march(half_of_a_car(load, f"{half}_no_derivatives"))
     for variant in ("fmi3", "fmi3_bare"):
         slave = half_of_a_car(load, f"{half}_{variant}")
@@ -330,7 +330,7 @@ def test_a_value_of_another_type_is_refused(
 
 
 def test_start_values_of_all_types_arrive(load: Load) -> None:
-    """As inputs that nobody connects."""
+    """Start values of inputs without a connection arrive, in all types."""
     slave = started(
         load("all_types3"),
         start_values={f"{name}_in": value for name, (value, _) in SCALARS.items()},

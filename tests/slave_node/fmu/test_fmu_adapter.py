@@ -139,7 +139,7 @@ def test_the_description_says_what_the_file_says(fmu_dir: Path) -> None:
 
 
 def test_the_slave_has_the_description_of_its_file(load: Load, fmu_dir: Path) -> None:
-    """What ``inspect`` shows is what a master gets."""
+    """Descriptions that ``inspect`` shows are those a master gets."""
     for model in MODELS:
         assert load(model).description == describe_fmu(fmu_dir / f"{model}.fmu")
 
@@ -181,7 +181,7 @@ def test_columns_are_those_named_at_initialization(load: Load) -> None:
     ],
 )
 def test_a_wrong_name_or_value_is_named(load: Load, arguments: dict, message: str) -> None:
-    """What the user wrote, and what he may have meant."""
+    """The error has the user's text, and the nearest right one."""
     with pytest.raises(ModelError) as caught:
         start(load("wheel"), **arguments)
     assert message in str(caught.value)
@@ -585,7 +585,7 @@ def test_nonsense_in_the_description_is_refused(
 def test_capabilities_that_are_not_there_are_not_used(
     fmu_dir: Path, tmp_path: Path, load: Load
 ) -> None:
-    """What the FMU does not declare is refused by name and never called."""
+    """Functions that the FMU does not declare are refused by name and never called."""
     fmu = changed(
         fmu_dir,
         tmp_path / "wheel.fmu",
@@ -659,7 +659,7 @@ def test_links_are_refused(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 @pytest.mark.parametrize("twin", ["modelDescription.xml", "./modelDescription.xml"])
 def test_entries_with_one_place_are_refused(tmp_path: Path, twin: str) -> None:
-    """What is checked is what is extracted, so no other entry may go to the same place."""
+    """Two entries must not go to one place: the checked one is the extracted one."""
     fmu = packed(tmp_path / "a.fmu", [*GOOD.items(), (twin, b"<!DOCTYPE x>")])
     assert f"entry {twin!r} is there twice" in refusal(fmu, tmp_path)
 
@@ -701,7 +701,7 @@ def test_document_types_are_refused(tmp_path: Path, kind: str, encoding: str) ->
 
 @pytest.mark.parametrize("encoding", ["utf-7", "utf-32", "cp037", "no-such-encoding"])
 def test_strange_encodings_are_refused(tmp_path: Path, encoding: str) -> None:
-    """What one parser reads as a comment, another must not read as a document type."""
+    """A comment for one parser must not be a document type for another."""
     head = f'<?xml version="1.0" encoding="{encoding}"?>'
     body = '<!DOCTYPE x [<!ENTITY i "i">]><fmiModelDescription modelName="&i;"/>'
     if encoding == "utf-7":

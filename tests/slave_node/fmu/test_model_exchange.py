@@ -117,7 +117,7 @@ def ball(
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_the_description_is_that_of_a_slave(load: Load, version: int) -> None:
-    """What the solver adds is there: polynomial inputs, any step size, saved states."""
+    """Additions of the solver are declared: polynomial inputs, any step size, saved states."""
     description = load(f"wheel_me{version}").description
     assert description.kind == f"FMI {version}.0 model exchange"
     assert description.state_kind is StateKind.NATIVE
@@ -164,7 +164,7 @@ def test_a_polynomial_goes_on_beyond_the_step(load: Load) -> None:
 
 
 def test_both_versions_are_the_same_model(load: Load) -> None:
-    """The same equations with the same solver give the same bits."""
+    """Equal equations with one solver give equal bits."""
     outputs = []
     for version in VERSIONS:
         slave = wheel(load, version)
@@ -439,7 +439,7 @@ def test_a_relay_whose_input_rests_at_the_limit(
 
 
 def test_what_a_slave_was_taken_back_from_leaves_no_trace(load: Load) -> None:
-    """Whether it has told of an event before or not: the same steps give the same, also where they
+    """Steps give equal bits with and without an event told and taken back, also where they
     end a bit before or behind the event.
     """
     rows = np.array([[293.15], [2.0]])

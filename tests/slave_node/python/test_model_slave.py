@@ -252,7 +252,7 @@ def test_a_step_of_too_many_inner_steps_is_rejected(monkeypatch):
 
 @pytest.mark.parametrize("solver", sorted(model_slave.SOLVERS))
 def test_restored_state_repeats_the_same_bits(solver):
-    """What follows a saved state depends on nothing that happened after it was saved."""
+    """A restored state repeats its future, whatever happened after it was saved."""
     model = type("Variant", (Pendulum,), {"solver": solver})
     slave = started(model)
     _, t = march(slave, 0.0, some_steps(2, 3, 2))
@@ -542,7 +542,7 @@ def test_description_of_a_model():
 
 
 def test_a_model_without_a_source_file_still_has_a_hash():
-    """Of its qualified name, so that it is the same in the next process."""
+    """The hash is of the qualified name, so that the next process has it too."""
     scope = {"__name__": "nowhere", "Model": Model}
     exec("class Ghost(Model): pass", scope)
     assert describe(scope["Ghost"]).sha256 == hashlib.sha256(b"nowhere.Ghost").hexdigest()
@@ -590,7 +590,7 @@ def test_reset_forgets_everything():
     ],
 )
 def test_wrong_set_up_is_named(arguments, message):
-    """What the user wrote wrong, and what he may have meant."""
+    """The error has the user's wrong text, and the nearest right one."""
     with pytest.raises(ConfigurationError) as caught:
         started(Pendulum, **arguments)
     assert message in str(caught.value)
@@ -686,7 +686,7 @@ def test_models_are_found_by_file_and_by_module():
     ],
 )
 def test_reference_that_leads_nowhere_is_named(tmp_path, reference, message):
-    """What is missing, what is near it, and what the module itself raised."""
+    """The error names the missing part, a near one, and the module's own error."""
     (tmp_path / "models.py").write_text(
         "from slave_node.model import Model\n"
         "class Car(Model): pass\nclass Truck(Model): pass\nnumber = 3\n"

@@ -144,7 +144,7 @@ def test_a_number_out_of_order_is_refused(sequence: int) -> None:
 
 
 def test_a_stale_epoch_is_refused_with_the_remedy() -> None:
-    """Who was held up and comes back after another took over is told so."""
+    """A master that comes back after another took over is told so."""
     claims = Claims()
     old = claims.claim(holder("run-1"))
     assert claims.admit(old, 1) is None

@@ -1,4 +1,4 @@
-"""What a slave on the bus promises its masters, with a real worker process behind it."""
+"""Promises of a slave on the bus to its masters, with a real worker process behind it."""
 
 from __future__ import annotations
 
@@ -188,7 +188,7 @@ class Pipe:
 
 @pytest.fixture
 def begun(tmp_path: Path) -> Iterator[Pipe]:
-    """What a `Slow` model says when it is in a step."""
+    """Pipe into which a `Slow` model writes when it is in a step."""
     pipe = Pipe(tmp_path / "begun")
     yield pipe
     pipe.close()
@@ -196,7 +196,7 @@ def begun(tmp_path: Path) -> Iterator[Pipe]:
 
 @pytest.fixture
 def go(tmp_path: Path) -> Path:
-    """What a `Slow` model waits for: a pipe that nobody writes to before the test does."""
+    """Pipe that a `Slow` model waits for until the test writes to it."""
     path = tmp_path / "go"
     os.mkfifo(path)
     return path
@@ -232,7 +232,7 @@ class Master:
         return self.again(calls)
 
     def again(self, calls: Sequence[Call]) -> Reply:
-        """The same request once more."""
+        """Reply to the last request, sent once more."""
         request = encode_request(self.epoch, self.sequence, encode_program(calls))
         return decode_reply(calls, self.ask(EXECUTE, request))
 
@@ -249,7 +249,7 @@ class Master:
         decode_map(self.ask(RELEASE, encode_map({"epoch": self.epoch})))
 
     def status(self) -> dict[str, Any]:
-        """What the slave says of itself."""
+        """Status of the slave."""
         return dict(decode_map(self.ask(STATUS)))
 
 
@@ -787,7 +787,7 @@ def test_a_dead_master_frees_a_slave_in_an_endless_step(
     go: Path,
     mortal: subprocess.Popen[bytes],
 ) -> None:
-    """Nobody waits for that step any more: it is ended, and the slave is free."""
+    """An endless step of a dead master is ended, and the slave is free."""
     served = serve("Slow", parameters={"begun": str(begun.path), "go": str(go)})
     master, vanish = vanishing(served, "run-1", pid=mortal.pid)
     master.start()

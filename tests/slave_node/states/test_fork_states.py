@@ -126,7 +126,7 @@ def car(folder: Path, state: str | None, chassis: str = "chassis", wheel: str = 
 
 
 def results(system: System, output: Path, kind: str, **options: Any) -> bytes:
-    """What a run writes, in which double steps were rejected and states saved like that."""
+    """Results file of a run that rejects double steps and saves states in the way ``kind``."""
     result = simulate(system, output=output, **options)
     assert result.summary["rejected_double_steps"] > 0
     models = Result.load(output).summary["settings"]["models"]
@@ -389,7 +389,7 @@ def test_a_state_that_is_not_expected_to_be_restored_is_restored_all_the_same(
 
 @pytest.mark.usefixtures("no_step_is_dear")
 def test_a_model_that_does_not_repeat_is_not_restored_elsewhere(tmp_path: Path) -> None:
-    """What it reads has changed behind its back: that is an error and no other state."""
+    """A file that changed under a model is an error, and gives no other state."""
     numbers = tmp_path / "numbers"
     numbers.write_text("".join(f"{number:7d}\n" for number in range(1000)))
     with loaded(f"{MODELS}:Reader", "fork", outputs=("y",), file=str(numbers)) as slave:
@@ -418,7 +418,7 @@ def test_habits_know_what_came_the_last_time() -> None:
 
 
 def test_habits_know_what_states_were_used_for() -> None:
-    """Of the first one in a situation the dearest is expected: that it will be restored."""
+    """The first state in a situation is expected to be restored, the most expensive use."""
     habits = Habits()
     situation = habits.situation
     assert habits.use(situation) is Event.GIVE_UP
@@ -458,7 +458,7 @@ def test_a_crash_without_a_saved_state_is_the_end_until_a_reset() -> None:
 
 
 def test_a_killed_saved_state_is_named(fmu_dir: Path) -> None:
-    """As the kernel does that runs out of memory."""
+    """A saved state that is killed, as by a kernel out of memory, is named."""
     with wheel(fmu_dir, "fork") as slave:
         before = family()
         state = slave.get_state()
@@ -531,7 +531,7 @@ def test_an_interrupt_is_not_for_holders(fmu_dir: Path) -> None:
 
 
 def test_a_worker_that_dies_unasked_is_not_the_doing_of_the_next_step(tmp_path: Path) -> None:
-    """The same for models in the worker itself; and of a worker that is gone nothing is known."""
+    """Models in the worker itself die with its cause; a worker that is gone has none."""
     worker = WorkerProcess(ModelReference(f"{MODELS}:Fragile", tmp_path, "x", state_kind="none"))
     worker.start()
     assert worker.pid is not None
@@ -631,7 +631,7 @@ def worker_in_an_endless_step(
 
 
 def test_a_worker_that_is_killed_in_an_endless_step_leaves_nobody(tmp_path: Path) -> None:
-    """As the node does it when the master says abort."""
+    """A worker that is killed in an endless step, as on abort, leaves no process."""
     worker, _, ends = worker_in_an_endless_step(tmp_path)
     wait_until(lambda: len(living(family())) == 4)  # worker, keeper, state, slave
     processes = family()

@@ -361,7 +361,7 @@ def test_a_restored_state_goes_on_bit_for_bit() -> None:
 
 
 def test_states_go_through_bytes(fmu_dir: Path, tmp_path: Path) -> None:
-    """Of a real FMU with substeps; bytes that are something else are refused."""
+    """States of a real FMU with substeps go through bytes; other bytes are refused."""
     slave = load_slave(
         "chassis.fmu", fmu_dir, "chassis", tmp_path, configuration=Configure(input_substeps=4)
     )
@@ -400,7 +400,7 @@ def test_states_go_through_bytes(fmu_dir: Path, tmp_path: Path) -> None:
 
 
 def test_a_description_without_loading_says_it_too(capability_dir: Path, fmu_dir: Path) -> None:
-    """What ``slave-node inspect`` shows is what a run will find."""
+    """Descriptions that ``slave-node inspect`` shows are those a run will find."""
     held = describe_model("chassis_no_derivatives.fmu", capability_dir)
     native = describe_model("chassis.fmu", fmu_dir)
     assert held.input_derivatives is InputDerivatives.EMULATED

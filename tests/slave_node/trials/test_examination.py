@@ -307,7 +307,7 @@ def test_fmus_with_a_clock_and_with_euler_steps(load: Load) -> None:
 
 
 def test_an_examined_fmu_goes_on_as_one_that_was_not(load: Load) -> None:
-    """The same bits in all that follows."""
+    """An examined FMU gives the bits of one that was not, in all that follows."""
     ends: list[Any] = []
     for is_examined in (True, False):
         slave = load("wheel_no_derivatives")

@@ -84,7 +84,7 @@ FORKED = (("fork", EXACT),)
 
 @dataclass(frozen=True)
 class Truth:
-    """How the results of what is tried on every model begin; "": it is not tried."""
+    """Beginnings of the results of the trials of every model; "": not tried."""
 
     states: tuple[tuple[str, str], ...] = (("native", EXACT),)
     """Each way to save states down to the one that is used."""
@@ -253,7 +253,7 @@ NEED_A_PROCESS = ("crashes", "hangs", "changes_process")
     ("folder", "fmu"), [(folder, fmu) for folder, fmus in FMUS.items() for fmu in fmus]
 )
 def test_every_report_is_true(request: pytest.FixtureRequest, folder: str, fmu: str) -> None:
-    """What an FMU was made to do is what is found, and each weakness comes with a consequence."""
+    """Reports find all that an FMU was made to do, and give each weakness a consequence."""
     truth = FMUS[folder][fmu]
     findings = list(
         validate(
@@ -340,7 +340,7 @@ def test_an_fmu_that_cannot_be_run_says_why(capability_dir: Path, fmu: str) -> N
 
 
 def test_a_python_model_is_validated_too() -> None:
-    """The same tests, without those of a model description."""
+    """Python models get the trials of FMUs, without those of a model description."""
     model = ROOT / "examples" / "quarter_car" / "quarter_car.py"
     found: dict[str, Finding] = {
         f.what: f for f in validate(f"{model.name}:Wheel", model.parent, worker=LocalWorker)

@@ -25,7 +25,7 @@ def ends() -> Iterator[tuple[Pipe, Pipe]]:
 
 
 def test_messages_of_any_length(ends: tuple[Pipe, Pipe]) -> None:
-    """What is sent arrives, byte by byte the same, however it is cut up; nothing of it is left for
+    """Messages arrive byte by byte as sent, however they are cut up; nothing is left for
     the next message, nor of the one before.
     """
     left, right = ends
@@ -56,7 +56,7 @@ def test_a_message_in_pieces() -> None:
 
 
 def test_an_end_is_noticed(ends: tuple[Pipe, Pipe]) -> None:
-    """What was sent before the end is still received; then reading and writing fail at once, and in
+    """Messages before the end are still received; then reading and writing fail at once, and in
     the middle of a message too.
     """
     left, right = ends

@@ -362,7 +362,7 @@ def test_models_are_named_by_the_package(packages: Packages, tmp_path: Path) -> 
 
 
 def test_settings_are_given_in_a_system_file(packages: Packages) -> None:
-    """What SSP cannot say is said by the file that import makes."""
+    """Settings that SSP cannot express are in the file that import makes."""
     path = packages.write(ssd(CAR, EXPERIMENT))
     with open_system(path) as opened:
         assert opened.places.setting("slaves.wheel", "step_size") == (

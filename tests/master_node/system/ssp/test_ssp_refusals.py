@@ -473,7 +473,7 @@ def test_damaged_descriptions_are_read_or_refused(tmp_path: Path, capability_dir
 
 
 def outcome(path: Path, models: Path) -> str:
-    """Whether a description is read or refused, with FMUs of all types for its components."""
+    """``read`` or ``refused``: outcome of a description whose components are FMUs of all types."""
     notes = Notes(str(path))
     try:
         structure = read_structure(path, path.parent, notes)

@@ -106,7 +106,7 @@ def test_transformations_are_composed(
     factors: list[tuple[float, float]],
     value: float,
 ) -> None:
-    """What one connection does is what all on the way do, one after the other."""
+    """One connection transforms as all on the way do, one after the other."""
     steps = [(linear(*pair), "") for pair in factors]
     packages = Packages(tmp_path_factory.mktemp("chain"), fmu_dir)
     read = packages.read(chain(steps, ["m"] * (len(steps) + 1)))
