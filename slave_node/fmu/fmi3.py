@@ -23,7 +23,7 @@ from slave_node.fmu.fmu_slave import FmuSlave
 from slave_node.fmu.instance import ADDRESS, DISCARD, ERROR, WARNING, FmuInstance
 from slave_node.fmu.log import FmuLog, choose_categories, wanted_categories
 from slave_node.fmu.saved_state import SavedState, pack, unpack
-from slave_node.fmu.times import is_at_border, meet
+from slave_node.fmu.times import is_at_border, is_within, meet
 from slave_node.fmu.values import ValueType
 
 MAX_EVENTS = 10_000
@@ -307,7 +307,8 @@ class Fmi3Slave(FmuSlave):
     ) -> StepResult:
         """See `Slave`. An event is not stepped over, and be it a rounding before the end."""
         end = communication_point + step_size
-        time = self._time if meet(self._time, communication_point) else communication_point
+        stands_there = is_within(self._time, communication_point, communication_point)
+        time = self._time if stands_there else communication_point
         for _ in range(MAX_EVENTS):
             target, has_event = end, self._fmi3.next_event_time <= end
             if has_event:
@@ -348,8 +349,7 @@ class Fmi3Slave(FmuSlave):
         if self._end.value:
             return StepResult(StepStatus.TERMINATED, self._reached.value)
         reached, end = self._reached.value, time + h
-        is_within = time <= reached <= end or meet(reached, time) or meet(reached, end)
-        if self._early.value and not is_within:
+        if self._early.value and not is_within(reached, time, end):
             raise SlaveError(
                 f"fmi3DoStep returned early at {reached!r} s, beside the step from {time!r} s to "
                 f"{end!r} s"

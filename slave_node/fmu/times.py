@@ -17,6 +17,16 @@ def meet(one: float, other: float) -> bool:
     return abs(one - other) <= 4.0 * math.ulp(max(abs(one), abs(other)))
 
 
+def is_within(time: float, begin: float, end: float) -> bool:
+    """True if a time lies in a step, or beside it by roundings alone [s].
+
+    The end of many steps differs from the time of an event by one rounding for each of them, and a
+    slave that has an event there stops at the event.
+    """
+    located = _located(begin, end)
+    return begin - located <= time <= end + located
+
+
 def is_at_border(time: float, begin: float, end: float) -> bool:
     """True if an event at ``time`` is one at the begin or the end of a step [s].
 
@@ -24,6 +34,9 @@ def is_at_border(time: float, begin: float, end: float) -> bool:
     back and comes again with a step that ends there; then it lies a bit earlier or later. All this
     depends on the step alone, as a slave has no memory of what it was taken back from.
     """
-    h = end - begin
-    located = _LOCATED * (max(abs(begin), abs(end)) + h)
-    return time - begin <= located or end - time <= max(located, SLACK * h)
+    located = _located(begin, end)
+    return time - begin <= located or end - time <= max(located, SLACK * (end - begin))
+
+
+def _located(begin: float, end: float) -> float:
+    return _LOCATED * (max(abs(begin), abs(end)) + end - begin)

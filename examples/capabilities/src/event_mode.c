@@ -1,7 +1,7 @@
 /* A staircase and a lag that follows it: the level (Int32, discrete) rises by 1 at every multiple
  * of 0.35 s, and x' = (level - x) / T with the exact solution. With event mode a step ends at the
  * next of these times; without, it passes over them and the level rises on the way. With
- * ROUNDS_EVENTS a step that ends a rounding before an event returns early at the event. With
+ * ROUNDS_EVENTS a step that ends some roundings before an event returns early at the event. With
  * LOSES_INDICATORS saved states lack the sign of the event indicator: after a restore from an event
  * the first step returns early after an internal step of 1 ms, for nothing.
  */
@@ -60,7 +60,7 @@ static Outcome step_up(void *block, void *hidden, Step *step)
     }
 #endif
 #ifdef ROUNDS_EVENTS
-    if (fabs(next_event(state) - step->reached) < 1e-15 * step->reached)
+    if (fabs(next_event(state) - step->reached) < 1e-14 * step->reached)
         step->reached = next_event(state);
 #endif
     while (next_event(state) <= step->reached) {

@@ -550,6 +550,30 @@ def test_events_a_rounding_beside_the_end_of_a_step(
         np.testing.assert_allclose(slave.get_outputs(0)[0, 0], staircase(t), rtol=1e-12)
 
 
+@pytest.mark.parametrize("early_return", [False, True])
+def test_events_some_roundings_beside_the_end_of_a_step(load: Load, early_return: bool) -> None:
+    """Early returns beyond the end by the roundings of many steps are ends of these steps.
+
+    A communication point after n steps differs from the event by one rounding for each, as in a
+    Reference FMU that is stepped 300 times by 0.01 s.
+    """
+    slave = started(
+        load("rounds_events3"),
+        outputs=("y",),
+        discrete_outputs=("level",),
+        early_return=early_return,
+    )
+    t, level = 0.0, 0
+    for event in (STAIR, 2 * STAIR, 3 * STAIR):
+        before = event - 30 * math.ulp(event)
+        for end in (event - 0.1, before, before + 0.1):
+            level += end == before
+            assert slave.do_step(t, step_to(t, end), False) == (StepStatus.OK, end)
+            t = end
+            assert slave.get_discrete_outputs() == (level,)
+            np.testing.assert_allclose(slave.get_outputs(0)[0, 0], staircase(t + 1e-14), rtol=1e-12)
+
+
 def test_an_early_return_is_an_event_for_the_master(load: Load) -> None:
     """The step stops at the event; back and with a step up to it, it is over and done."""
     slave = started(
