@@ -101,6 +101,7 @@ class Examine:
         step_size: of the trial steps that show whether saved states can be trusted [s].
         relative_tolerance, absolute_tolerance: of the coupling; weights for differences.
         largest_step: no trial step is longer [s]; None: 32 of ``step_size``.
+        smallest_step: no trial step is shorter [s].
         inputs: values of the continuous inputs, in the order of `SetInputs`; empty: they stay.
         input_changes: by how much each of them may be moved in a trial step.
         input_order: highest order of input derivatives to try.
@@ -115,6 +116,7 @@ class Examine:
     relative_tolerance: float = 1e-4
     absolute_tolerance: float = 1e-4
     largest_step: float | None = None
+    smallest_step: float = 0.0
     inputs: tuple[float, ...] = ()
     input_changes: tuple[float, ...] = ()
     input_order: int = 0

@@ -167,6 +167,7 @@ def _call(
         float(simulation.relative_tolerance if relative is None else relative),
         float(simulation.absolute_tolerance if absolute is None else absolute),
         largest_step=largest,
+        smallest_step=float(settings.smallest_step_size or 0.0),
         inputs=tuple((values + changes).tolist()),
         input_changes=tuple(changes.tolist()),
         input_order=min(part.max_order, order) if is_native else 0,

@@ -79,6 +79,7 @@ CALL_FIELDS: Mapping[type[Call], Mapping[str, checks.Check]] = {
         "relative_tolerance": checks.number,
         "absolute_tolerance": checks.number,
         "largest_step": checks.optional(checks.number),
+        "smallest_step": checks.number,
         "inputs": checks.numbers,
         "input_changes": checks.numbers,
         "input_order": checks.integer,

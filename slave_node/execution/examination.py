@@ -168,14 +168,15 @@ def _test_states(trial: Trial, origin: Place) -> tuple[States, float]:
     size = trial.call.step_size
     if fixed is not None:
         size = fixed * max(1, round(size / fixed))
+    reasons = []
     for _ in range(_SHRINKS if trial.takes_any_step else 1):
         try:
             return compare(trial, origin, size), size
         except TrialError as error:
-            reason = str(error)
+            reasons.append(str(error))
             size *= _SHRINK
             origin.restored()
-    raise TrialError(f"no trial step succeeded, the last one: {reason}")
+    raise TrialError(f"no trial step succeeded, the first one: {reasons[0]}")
 
 
 def _with_steps_of_any_size(

@@ -185,9 +185,12 @@ class Trial:
         """A step of ``size`` from ``time`` [s], and what is read behind it.
 
         Raises:
-            TrialError: it was not completed, or a value is not finite.
+            TrialError: it is shorter than a trial step may be, it was not completed, or a value is
+                not finite.
         """
         where = f"a step of {size!r} s at t={time!r} s"
+        if size < self.call.smallest_step:
+            raise TrialError(f"{where} would be too short for the slave")
         try:
             result = self.slave.do_step(time, size, False)
             if result.status is not StepStatus.OK:

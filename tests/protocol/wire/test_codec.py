@@ -138,6 +138,7 @@ calls = st.one_of(
         any_float,
         any_float,
         st.none() | any_float,
+        any_float,
         st.lists(any_float, max_size=3).map(tuple),
         st.lists(any_float, max_size=3).map(tuple),
         st.integers(0, 3),

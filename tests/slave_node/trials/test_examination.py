@@ -96,6 +96,19 @@ def test_trial_steps_that_are_too_long_are_made_smaller() -> None:
     assert "too long" in found.state_reason
 
 
+def test_no_trial_step_is_shorter_than_the_smallest_one() -> None:
+    """The smallest step size of the slave holds in trials too, however they shorten steps."""
+    shortest = []
+    for smallest in (0.0, 0.5 * H):
+        slave = TimedSlave()
+        found = examine(slave, 0.0, H, smallest_step=smallest)
+        assert found.state_verdict is StateVerdict.EXACT
+        shortest.append(min(size for _, size in slave.steps))
+    assert shortest[0] < 0.5 * H <= shortest[1]
+    found = examine(BoundedSlave(0.1 * H), 0.0, H, smallest_step=0.5 * H)
+    assert "too long" in found.state_reason  # and not that shorter ones are too short
+
+
 def test_a_fatal_error_is_no_verdict() -> None:
     """After it nothing may be called any more, so the executor must know."""
     with pytest.raises(FatalSlaveError):
