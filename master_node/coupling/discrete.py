@@ -6,7 +6,7 @@ one. It takes no part in extrapolation and in the error norm.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -173,8 +173,17 @@ class DiscreteCoupling:
             return ()
         return tuple(b if k is None else k for k, b in zip(known, before, strict=True))
 
+    def changing(self, before: DiscreteValues, after: DiscreteValues) -> frozenset[int]:
+        """Indices of the discrete outputs that feed an input and have changed."""
+        return frozenset(index for index in self._connected if before[index] != after[index])
+
     def changed(
-        self, before: DiscreteValues, after: DiscreteValues, begin: float, end: float
+        self,
+        before: DiscreteValues,
+        after: DiscreteValues,
+        begin: float,
+        end: float,
+        restless: Set[int] = frozenset(),
     ) -> str:
         """``slave.variable`` of what has changed, or "".
 
@@ -185,9 +194,10 @@ class DiscreteCoupling:
             after: discrete outputs at ``end``.
             begin: when those before were read [s].
             end: when those behind were read [s].
+            restless: indices of the outputs that change all the time, and do not count.
         """
         for index in self._connected:
-            if before[index] != after[index]:
+            if before[index] != after[index] and index not in restless:
                 return self.names[index]
         for one in self._searched:
             if one.signal.at(begin) != one.signal.at(end):

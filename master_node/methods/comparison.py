@@ -247,7 +247,9 @@ class ComparedSteps:
         """Accept a double step with this error, or go back and look for what changed."""
         if way.crossing:
             return self.over_jump(step, error, None, way.crossing)
-        return self._decide(position._replace(doubt=None), way.target, step, error)
+        restless = self._discontinuities.restless(position, step)
+        position = position._replace(doubt=None, restless=restless)
+        return self._decide(position, way.target, step, error)
 
     def _decide(
         self, position: Position, target: float, step: DoubleStep, error: StepError
@@ -394,6 +396,10 @@ class ComparedSteps:
 
     def following(self, position: Position, step: DoubleStep, verdict: Verdict) -> Position:
         """Where the run stands behind an accepted double step, and what it tries next."""
+        restless = self._discontinuities.restless(position, step)
+        return self._following(position, step, verdict)._replace(restless=restless)
+
+    def _following(self, position: Position, step: DoubleStep, verdict: Verdict) -> Position:
         times, defects, error = step.times, verdict.defects, verdict.error
         assert error is not None  # as of every double step
         history = step.history.pushed(times.end, step.end_inputs)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from master_node.coupling.outputs import Outputs
 from master_node.coupling.overrides import NO_OVERRIDES, Overrides
+from master_node.judging.restless import RestlessOutputs
 from master_node.methods.coupling_memory import CouplingMemory
 from master_node.numerics.discontinuities import Search, SmoothStep
 from master_node.numerics.extrapolation import CouplingHistory
@@ -81,6 +82,7 @@ class Position(NamedTuple):
         steps: number of steps taken, of a method that counts them.
         overrides: connected inputs that are cut from their sources.
         given: values that variables were set to during the run.
+        restless: discrete outputs that change in every step.
     """
 
     history: CouplingHistory
@@ -100,6 +102,7 @@ class Position(NamedTuple):
     steps: int = 0
     overrides: Overrides = NO_OVERRIDES
     given: tuple[GivenValue, ...] = ()
+    restless: RestlessOutputs = RestlessOutputs()
 
     @property
     def time(self) -> float:

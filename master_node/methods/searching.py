@@ -6,16 +6,20 @@ smallest H, or in the first small step of one whose error is within the toleranc
 
 from __future__ import annotations
 
+import logging
 from typing import NamedTuple
 
 from master_node.judging.comparison import StepError
 from master_node.judging.jumps import InputDefects
+from master_node.judging.restless import RestlessOutputs
 from master_node.methods.base import Back, Setup, summed
 from master_node.methods.position import Position
 from master_node.numerics.discontinuities import Defects, Inputs, Search, SmoothStep
 from master_node.numerics.step_size_controller import passes
 from master_node.numerics.step_size_limits import StepSizeLimits
 from master_node.stepping.double_step import DoubleStep
+
+log = logging.getLogger("master_node")
 
 
 class Jumps(NamedTuple):
@@ -63,6 +67,7 @@ class Discontinuities:
         self._looks_for_jumps = setup.system.simulation.discontinuities
         self._looks_for_changes = self._looks_for_jumps and self._coupled.discrete.holds_inputs
         self._defects = InputDefects(self._coupled, setup.scheme)
+        self._told_restless: set[int] = set()
 
     def nothing(self) -> Search:
         """The beginning: nothing is looked for, no false alarm is known."""
@@ -94,6 +99,28 @@ class Discontinuities:
         times = position.history.times
         return len(times) > 1 and times[1] < self._start
 
+    def restless(self, position: Position, step: DoubleStep) -> RestlessOutputs:
+        """The outputs that change all the time, as one more double step shows; warns of each."""
+        if not self._looks_for_changes:
+            return position.restless
+        d_middle, d_end = step.discrete
+        changing = self._coupled.discrete.changing
+        found = position.restless.noted(
+            changing(position.outputs.d, d_middle), changing(d_middle, d_end)
+        )
+        for index in sorted(found.outputs - self._told_restless):
+            self._told_restless.add(index)
+            log.warning(
+                "%s is discrete and changes in every small step, at t=%r s with H = %r s: its "
+                "changes are not searched for while it does, and its input is held in each step; "
+                "ERR tells what that costs. An output that moves all the time is better declared "
+                "continuous",
+                self._coupled.discrete.names[index],
+                step.times.begin,
+                step.times.step_size,
+            )
+        return found
+
     def event(self, position: Position, step: DoubleStep) -> str:
         """Changes at once in a double step, in words; "" if there is none."""
         event = position.event
@@ -104,8 +131,9 @@ class Discontinuities:
         d_middle, d_end = step.discrete
         changed = self._coupled.discrete.changed
         begin, middle, end = step.times[:3]
-        name = changed(position.outputs.d, d_middle, begin, middle)
-        name = name or changed(d_middle, d_end, middle, end)
+        restless = position.restless.outputs
+        name = changed(position.outputs.d, d_middle, begin, middle, restless)
+        name = name or changed(d_middle, d_end, middle, end, restless)
         return f"{name} changes" if name else ""
 
     def change(
@@ -124,15 +152,15 @@ class Discontinuities:
             return None
         times = step.times
         d_middle, d_end = step.discrete
-        changed = self._coupled.discrete.changed
+        changed, restless = self._coupled.discrete.changed, position.restless.outputs
         step_size, unchanged = 0.5 * times.first, position.unchanged
-        name = changed(d_middle, d_end, times.middle, times.end)
+        name = changed(d_middle, d_end, times.middle, times.end, restless)
         if name:
             landing = self._limits.landing(self._start, times.begin, times.middle, target)
             if landing is not None:
                 step_size, unchanged = times.second, landing
         else:
-            name = changed(position.outputs.d, d_middle, times.begin, times.middle)
+            name = changed(position.outputs.d, d_middle, times.begin, times.middle, restless)
             if not name or passes(error.norm):
                 return None
         step_size = self._limits.bounded(step_size)
