@@ -26,8 +26,11 @@ from protocol.errors import DoublestepError
 from protocol.signals import FloatArray
 from slave_node.fmu.description import describe_fmu
 
-_CONVERGED = 0.5
+_CONVERGED = 2.0
 """The reference is one where halving the steps changes nothing by more than this [tolerances]."""
+
+_ENOUGH = 0.1
+"""Steps are not halved any more once that changes nothing by more than this [tolerances]."""
 
 _DOUBLINGS = 14
 _COLUMNS = 3
@@ -243,7 +246,7 @@ def find_reference(system: System, scale: Scale, deadline: float) -> Reference:
             change, _ = scale.distance(names, last, new)
             if reference is None or reference.steps < steps or change < reference.change:
                 reference = Reference(new, change, steps)
-        if reference is not None and reference.change <= _CONVERGED / 5.0:
+        if reference is not None and reference.change <= _ENOUGH:
             break
         if reference is not None and monotonic() + 2.0 * (monotonic() - begin) > deadline:
             break
@@ -276,6 +279,8 @@ def find_cheapest(
         for steps in _step_numbers():
             if monotonic() > deadline:
                 return best
+            if steps > most:  # each slave takes at least one do_step in a step
+                break
             try:
                 result = run_fixed(system, steps, order)
             except DoublestepError:
