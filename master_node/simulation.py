@@ -308,7 +308,7 @@ def _opened(
         slaves = stack.enter_context(
             opened_slaves(
                 system,
-                None if directory is None or mode.in_process else _logs(directory),
+                None if directory is None else _logs(directory, is_needed=not mode.in_process),
                 in_process=mode.in_process,
                 launch=mode.launch,
                 uploading=uploading,
@@ -432,9 +432,10 @@ def _restorable(slaves: Slaves, system: System, directory: Path | None) -> list[
     ]
 
 
-def _logs(directory: Path) -> Path:
+def _logs(directory: Path, *, is_needed: bool) -> Path:
+    """Folder of logs, made if it is needed from the start."""
     folder = directory / "logs"
     try:
-        return own_folder(folder)
+        return own_folder(folder) if is_needed else folder
     except OSError as error:
         raise cannot_write(folder, error) from error

@@ -41,6 +41,8 @@ class Configure:
             takes any: polynomials of higher degree are emulated with pieces of this degree.
         not_repeating: names of outputs that do not repeat, such as clocks: what they give is
             compared with nothing.
+        log_categories: patterns of the log categories that an FMU is asked for; empty: those of
+            warnings and errors.
     """
 
     verb: ClassVar[str] = "configure"
@@ -50,6 +52,7 @@ class Configure:
     input_substeps: int = 0
     max_input_order: int = MAX_ORDER
     not_repeating: tuple[str, ...] = ()
+    log_categories: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,6 +352,25 @@ class RecordedValues(NamedTuple):
     others: tuple[StartValue, ...]
 
 
+class ModelWarnings(NamedTuple):
+    """Messages and calls of a model with the status Warning, since they were asked for last.
+
+    Attributes:
+        number: of them.
+        first: text of the first one.
+    """
+
+    number: int = 0
+    first: str = ""
+
+    def after(self, text: str) -> ModelWarnings:
+        """These and one more."""
+        return ModelWarnings(self.number + 1, self.first or text)
+
+
+NO_WARNINGS = ModelWarnings()
+
+
 class Reply(NamedTuple):
     """Reply to a program of calls.
 
@@ -357,8 +379,10 @@ class Reply(NamedTuple):
         error: why the next call failed, or None. A step that was not ``ok`` is not an error:
             it is the last result.
         compute_time: seconds that the slave spent on the program, by its monotonic clock.
+        warnings: of the model, since the last reply.
     """
 
     results: list[object]
     error: DoublestepError | None
     compute_time: float
+    warnings: ModelWarnings = NO_WARNINGS

@@ -13,7 +13,15 @@ from typing import Protocol
 
 import numpy as np
 
-from protocol.calls import Call, Initialize, RecordedValues, Reply, StepResult
+from protocol.calls import (
+    NO_WARNINGS,
+    Call,
+    Initialize,
+    ModelWarnings,
+    RecordedValues,
+    Reply,
+    StepResult,
+)
 from protocol.description import SlaveDescription
 from protocol.errors import SlaveError
 from protocol.signals import FloatArray
@@ -115,6 +123,10 @@ class Slave(ABC):
     @abstractmethod
     def deserialize_state(self, data: bytes) -> object:
         """A saved state from bytes that ``serialize_state`` of the same model gave."""
+
+    def take_warnings(self) -> ModelWarnings:
+        """Warnings of the model since the last call; never raises."""
+        return NO_WARNINGS
 
     @abstractmethod
     def terminate(self) -> None:

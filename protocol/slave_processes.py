@@ -73,13 +73,16 @@ class SlaveProcess:
         command = python_command("-m", "slave_node", "serve")
         command += ["--base", str(base), "--name", key.name, "--instance", key.instance]
         command += [*connection, "--load-timeout", repr(load_timeout), "--stay-with-parent"]
+        command += ["--log-file", str(log.absolute())]
         if processor is not None:
             command += ["--processor", str(processor)]
         command += ["--", model]  # which may begin with a dash
         self.key = key
         self.log = log
         try:
-            with open_old(log, to_append=True) if goes_on else open_new(log) as file:
+            if not goes_on:
+                open_new(log).close()
+            with open_old(log, to_append=True) as file:
                 self._process = subprocess.Popen(
                     command,
                     stdin=subprocess.PIPE,

@@ -9,6 +9,7 @@ from tempfile import mkdtemp
 
 from protocol.calls import Configure
 from protocol.description import Experiment, SlaveDescription
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.slave import CallExecutor, Slave
 from slave_node.execution.executor import Executor
 from slave_node.models import DEFAULT, default_experiment, describe_alone, load_model
@@ -21,7 +22,7 @@ def load_slave(
     name: str,
     scratch: Path,
     *,
-    log_all: bool = False,
+    output: LogOutput = SILENT,
     configuration: Configure = DEFAULT,
 ) -> Slave:
     """The slave for ``model``, whose state is saved as the configuration says or as is best.
@@ -32,7 +33,7 @@ def load_slave(
         base: directory of the system file, or the working directory.
         name: instance name.
         scratch: an existing empty directory to extract into; the caller removes it after close.
-        log_all: let an FMU log all its categories.
+        output: where the messages of an FMU go, and which ones it is asked for.
         configuration: as it is to be run.
 
     Raises:
@@ -43,12 +44,12 @@ def load_slave(
 
     def load() -> Slave:
         directory = Path(mkdtemp(prefix="model-", dir=scratch))
-        return load_model(model, base, name, directory, log_all=log_all, configuration=alone)
+        return load_model(model, base, name, directory, output=output, configuration=alone)
 
     def load_forking(reason: str) -> Slave:
         from slave_node.states.fork_slave import ForkSlave, HeldModel  # noqa: PLC0415  Linux only
 
-        return ForkSlave(HeldModel(model, base, name, scratch, log_all, alone), reason)
+        return ForkSlave(HeldModel(model, base, name, scratch, output, alone), reason)
 
     return with_states(choice, load, load_forking)
 
@@ -74,7 +75,7 @@ def load_executor(
     name: str,
     scratch: Path,
     *,
-    log_all: bool = False,
+    output: LogOutput = SILENT,
     state_kind: str = "",
 ) -> CallExecutor:
     """Executor of a model, ready for calls and to load the model in another configuration.
@@ -89,8 +90,6 @@ def load_executor(
         directory.mkdir()
         if not configuration.state_kind:
             configuration = replace(configuration, state_kind=state_kind)
-        return load_slave(
-            model, base, name, directory, log_all=log_all, configuration=configuration
-        )
+        return load_slave(model, base, name, directory, output=output, configuration=configuration)
 
     return Executor(load(DEFAULT), load)

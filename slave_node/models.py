@@ -9,6 +9,7 @@ from protocol.calls import Configure
 from protocol.description import Experiment, SlaveDescription
 from protocol.errors import ModelError
 from protocol.host.files import is_fmu
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.host.scratch import ScratchDirectory
 from protocol.host.user_code import user_context
 from protocol.slave import Slave
@@ -26,7 +27,7 @@ def load_model(
     name: str,
     scratch: Path,
     *,
-    log_all: bool = False,
+    output: LogOutput = SILENT,
     configuration: Configure = DEFAULT,
 ) -> Slave:
     """The slave of the model alone: its state is saved natively or not at all.
@@ -40,7 +41,7 @@ def load_model(
             (base / model).resolve(),
             scratch,
             name,
-            log_all=log_all,
+            output=output._replace(categories=configuration.log_categories or output.categories),
             structural_parameters=configuration.structural_parameters,
         )
         configuration = replace(configuration, structural_parameters={})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from protocol.calls import Initialize, RecordedValues, StepResult
+from protocol.calls import Initialize, ModelWarnings, RecordedValues, StepResult
 from protocol.signals import FloatArray
 from protocol.slave import Slave
 from protocol.variables import StartValue
@@ -63,6 +63,10 @@ class WrappedSlave(Slave):
     def get_recorded_variables(self) -> RecordedValues:
         """See `Slave`."""
         return self._slave.get_recorded_variables()
+
+    def take_warnings(self) -> ModelWarnings:
+        """See `Slave`."""
+        return self._slave.take_warnings()
 
     def terminate(self) -> None:
         """See `Slave`."""

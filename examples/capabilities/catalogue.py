@@ -450,6 +450,13 @@ def _ends() -> Iterator[Fmu]:
         version=3,
         capabilities=Capabilities(output_derivatives=1),
     )
+    for version in (1, 2, 3):
+        yield make_fmu(
+            lag_description(f"warns{version}", "A lag that warns from 0.5 s on"),
+            (*LAG, SOURCES / "warns.c"),
+            version=version,
+            capabilities=Capabilities(saved_states=version > 1),
+        )
     stairs = (
         ("event_mode3", None),
         ("rounds_events3", {"ROUNDS_EVENTS": "1"}),

@@ -168,6 +168,14 @@ def run(  # noqa: PLR0917  options of the command line
         ),
     ] = False,
     no_examine: NoExamine = False,
+    fmi_logging: Annotated[
+        bool,
+        typer.Option(
+            "--fmi-logging",
+            help="Let all FMUs log all their categories.",
+            rich_help_panel=OBSERVATION,
+        ),
+    ] = False,
     trace: Annotated[
         Path | None,
         typer.Option(
@@ -229,7 +237,7 @@ def run(  # noqa: PLR0917  options of the command line
                 initial_step_size=step_size,
                 examine=False if no_examine else None,
             )
-            .with_slaves(state=state)
+            .with_slaves(state=state, fmi_logging=("*",) if fmi_logging else None)
             .with_bus(
                 connect=tuple(connect or ()),
                 listen=tuple(listen or ()),

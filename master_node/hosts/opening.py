@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
@@ -39,6 +39,7 @@ from protocol.errors import (
     SlaveLostError,
 )
 from protocol.host.clock import SYSTEM_CLOCK, Clock
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.host.logs import add_log_fields
 from protocol.host.scratch import ScratchDirectory
 from protocol.slave_processes import connection_options
@@ -94,14 +95,15 @@ def opened_slaves(
 
     Args:
         system: what to run.
-        log_directory: existing; gets the launched slaves' logs; None: these are not kept.
+        log_directory: gets the logs of slaves that are launched, for which it has to be there, or
+            run in process; None: these are not kept.
         in_process: all slaves in this process; else over Zenoh.
         launch: start slaves that have a model; False: find all of them on the bus.
         uploading: told of models that are sent to agents.
         baseline: see `slaves_in_process`.
     """
     if in_process:
-        with slaves_in_process(system, baseline) as slaves:
+        with slaves_in_process(system, baseline, log_directory) as slaves:
             yield slaves
         return
     with ScratchDirectory() as temporary:
@@ -111,12 +113,15 @@ def opened_slaves(
 
 
 @contextmanager
-def slaves_in_process(system: System, baseline: Baseline | None = None) -> Iterator[Slaves]:
+def slaves_in_process(
+    system: System, baseline: Baseline | None = None, log_directory: Path | None = None
+) -> Iterator[Slaves]:
     """All slaves in this process, without a bus.
 
     Args:
         system: what to run.
         baseline: to which the process returns from what models do to it; None: as it is now.
+        log_directory: made, if it is not there, for what models say; None: that is not kept.
 
     Raises:
         ConfigurationError: a slave has no model, or its model cannot be loaded.
@@ -135,13 +140,30 @@ def slaves_in_process(system: System, baseline: Baseline | None = None) -> Itera
             scratch = stack.enter_context(ScratchDirectory())
             process = SharedProcess(baseline)
             try:
-                executor = process.run(load, settings.model, system.base, name, scratch)
+                executor = process.run(
+                    load,
+                    settings.model,
+                    system.base,
+                    name,
+                    scratch,
+                    output=_log_of(name, log_directory),
+                )
             except DoublestepError as error:
                 raise error.located(slave=name) from None
             stack.callback(process.run, executor.close)
             links[name] = LocalSlave(executor, process)
             descriptions[name] = executor.description
         yield Slaves(links, descriptions, hosts=dict.fromkeys(links, socket.gethostname()))
+
+
+def _log_of(name: str, directory: Path | None) -> LogOutput:
+    """A new log, in place of one that is there."""
+    if directory is None:
+        return SILENT
+    file = directory.absolute() / f"{name}.log"
+    with suppress(OSError):
+        file.unlink(missing_ok=True)
+    return LogOutput(str(file))
 
 
 @contextmanager

@@ -151,6 +151,8 @@ class SlaveStatistics:
         request_time: from sending a request to having its reply. Replies are collected in the
             order of the slaves, so it includes waiting for slower ones before.
         restarts: how often its process was replaced.
+        warnings: messages and calls of its model with the status Warning, also in steps that were
+            rejected, but not in trial steps.
     """
 
     do_steps: int = 0
@@ -159,6 +161,7 @@ class SlaveStatistics:
     compute_time: float = 0.0
     request_time: float = 0.0
     restarts: int = 0
+    warnings: int = 0
 
     @property
     def transport_time(self) -> float:

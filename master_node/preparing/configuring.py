@@ -77,4 +77,5 @@ def configuration(slave: str, system: System, description: SlaveDescription) -> 
         ),
         largest_substep=None if largest is None else float(largest),
         input_substeps=settings.input_substeps,
+        log_categories=settings.fmi_logging,
     )

@@ -22,9 +22,9 @@ _WITHOUT_TEXTS = [name for name, one in FORMATS.items() if not one.holds_texts]
 def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> dict[str, Any]:
     """The summary of a run as plain data for JSON; a number that is not finite is None.
 
-    ``state_kind``, ``do_steps``, ``rollbacks``, ``restarts``, ``requests``, ``compute_time`` [s]
-    and ``transport_time`` [s] are maps by slave, ``controlled_by`` by the kind of control,
-    ``units``, ``discrete_types`` and ``enumerations`` by variable.
+    ``state_kind``, ``do_steps``, ``rollbacks``, ``restarts``, ``model_warnings``, ``requests``,
+    ``compute_time`` [s] and ``transport_time`` [s] are maps by slave, ``controlled_by`` by the kind
+    of control, ``units``, ``discrete_types`` and ``enumerations`` by variable.
     """
     statistics = end.statistics
     simulation = settings.get("simulation")
@@ -60,6 +60,7 @@ def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> d
             "do_steps": {name: slave.do_steps for name, slave in slaves},
             "rollbacks": {name: slave.rollbacks for name, slave in slaves},
             "restarts": {name: slave.restarts for name, slave in slaves},
+            "model_warnings": {name: slave.warnings for name, slave in slaves},
             "requests": {name: slave.requests for name, slave in slaves},
             "compute_time": {name: slave.compute_time for name, slave in slaves},
             "transport_time": {name: slave.transport_time for name, slave in slaves},

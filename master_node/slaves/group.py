@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 
 from master_node.observing.observers import Exchange, ExchangeListener, SlaveStatistics, Statistics
 from master_node.slaves.link import SlaveLink
-from protocol.calls import Call, DoStep, Examine, Reply
+from protocol.calls import Call, DoStep, Examine, ModelWarnings, Reply
 from protocol.errors import DoublestepError
+
+log = logging.getLogger("master_node")
 
 Program = tuple[Call, ...]
 
@@ -35,6 +38,7 @@ class SlaveGroup:
         self.names = tuple(links)
         self._links = tuple(links.values())
         self._indices = range(len(self.names))
+        self._warned: set[int] = set()
         self.restart_statistics()
 
     def restart_statistics(self) -> None:
@@ -101,6 +105,8 @@ class SlaveGroup:
                 statistics = self._statistics[index]
                 statistics.requests += 1
                 statistics.compute_time += reply.compute_time
+                if reply.warnings.number:
+                    self._note_warnings(index, reply.warnings)
                 statistics.request_time += (sent - begun) + (now - all_sent)
                 if reply.error is not None:
                     self._located(reply.error, index, program)
@@ -114,6 +120,18 @@ class SlaveGroup:
         if failure is not None:
             raise failure.located(time=time, step_size=step_size)
         return replies
+
+    def _note_warnings(self, index: int, warnings: ModelWarnings) -> None:
+        """Count warnings of a model, and tell the first one."""
+        self._statistics[index].warnings += warnings.number
+        if index not in self._warned:
+            self._warned.add(index)
+            log.warning(
+                "%s: its model warns: %s; its log has all of them, and model_warnings in "
+                "summary.json their number",
+                self.names[index],
+                warnings.first,
+            )
 
     def _exchange(  # noqa: PLR0917  once for each request
         self,

@@ -5,8 +5,8 @@ to go where the user said, Ctrl-C has to be heard, and the next model has to fin
 in its own process. So what models change is put back when they return:
 
 - *after each request* the working directory, which each model finds again as it left it, the
-  handlers of Ctrl-C and SIGTERM, and what hangs on a context: NumPy's handling of errors, the
-  decimal context. (The floating-point
+  handlers of Ctrl-C and SIGTERM, a Ctrl-C that came while a model wrote to its log, and what hangs
+  on a context: NumPy's handling of errors, the decimal context. (The floating-point
   environment is put back by ``slave_node/execution/executor.py``, in every process.)
 - *after loading, initialization and all else but steps* the umask, the standard streams and their
   descriptors, the locale, signal handlers, and what `logging` is told to swallow.
@@ -68,6 +68,7 @@ class SharedProcess:
             self._directory = None if is_ours else here
             if not is_ours:
                 _go_to(self._baseline.directory)
+            self._baseline.raise_late()
 
     def run(self, action: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
         """Let the model do anything else."""
@@ -93,6 +94,22 @@ class Baseline:
         self._descriptors = [(number, os.dup(number)) for number in range(3) if is_open(number)]
         self._locale = locale.setlocale(locale.LC_ALL)
         self._logging = logging.root.manager.disable, list(logging.root.handlers)
+        self._late: list[BaseException] = []
+
+    def note_unraisable(self, unraisable: Any) -> None:
+        """Keep a Ctrl-C that came while a model called back: C code hands on no exception."""
+        error = unraisable.exc_value
+        if error is None or isinstance(error, Exception):
+            sys.__unraisablehook__(unraisable)
+        else:
+            self._late.append(error)
+
+    def raise_late(self) -> None:
+        """Raise what was kept, if anything."""
+        if self._late:
+            error = self._late[0]
+            self._late.clear()
+            raise error
 
     def restore(self) -> None:
         """Bring it back."""
@@ -122,7 +139,8 @@ def shared_process() -> Iterator[Baseline]:
     """The process as it is at the begin, also after the end."""
     baseline, signals = Baseline(), _Signals()
     path, environment = list(sys.path), dict(os.environ)
-    limit = sys.getrecursionlimit()
+    limit, hook = sys.getrecursionlimit(), sys.unraisablehook
+    sys.unraisablehook = baseline.note_unraisable
     try:
         with warnings.catch_warnings():
             yield baseline
@@ -132,6 +150,7 @@ def shared_process() -> Iterator[Baseline]:
             os.environ.clear()
             os.environ.update(environment)
         sys.setrecursionlimit(limit)
+        sys.unraisablehook = hook
         baseline.restore()
         signals.restore()
         baseline.close()

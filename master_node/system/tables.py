@@ -78,6 +78,8 @@ class SlaveSettings(FrozenTable):
         uncontrolled: names of the outputs that do not count in ERR.
         ignore_bounds: take values beyond the ``min`` and ``max`` of its variables, and numbers that
             no item of an enumeration has.
+        fmi_logging: patterns of the log categories of its FMU that are written to its log, such as
+            ``["*"]``; default: those of warnings and errors.
     """
 
     model: StrictStr | None = None
@@ -99,6 +101,7 @@ class SlaveSettings(FrozenTable):
     output_derivatives: tuple[StrictStr, ...] | None = None
     uncontrolled: tuple[StrictStr, ...] = ()
     ignore_bounds: StrictBool = False
+    fmi_logging: tuple[StrictStr, ...] = ()
 
     @model_validator(mode="after")
     def _agent_needs_model(self) -> Self:

@@ -80,6 +80,11 @@ class TextFormatter(logging.Formatter):
         return "\n".join(f"  {printable(t)}" for t in super().formatException(ei).splitlines())
 
 
+def formatter(style: LogFormat, text_format: str, **known: object) -> logging.Formatter:
+    """Formatter of lines; arguments as of `configure_logs`."""
+    return JsonFormatter(known) if style is LogFormat.JSON else TextFormatter(text_format)
+
+
 def configure_logs(style: LogFormat, text_format: str, **known: object) -> None:
     """Write the log of this process to standard error, in place of what was configured before.
 
@@ -91,9 +96,7 @@ def configure_logs(style: LogFormat, text_format: str, **known: object) -> None:
         **known: fields that all JSON lines have.
     """
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(
-        JsonFormatter(known) if style is LogFormat.JSON else TextFormatter(text_format)
-    )
+    handler.setFormatter(formatter(style, text_format, **known))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     for package in _PACKAGES:
         logging.getLogger(package).setLevel(logging.INFO)

@@ -4,6 +4,7 @@
 
     request  [version, epoch, sequence, program]      program: the bytes of [shape, numbers]
     reply    [version, shape, numbers, error, compute_time]     error: nil or a map
+             and [number, first] behind that, if the model has given warnings
 
     shape    the bytes of [call, call, ...] or [result, result, ...] with their numbers left out
     numbers  all those numbers, float64, little-endian, in order

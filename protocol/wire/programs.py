@@ -60,6 +60,7 @@ CALL_FIELDS: Mapping[type[Call], Mapping[str, checks.Check]] = {
         "input_substeps": checks.integer,
         "max_input_order": checks.integer,
         "not_repeating": checks.names,
+        "log_categories": checks.names,
     },
     Initialize: {
         "start_time": checks.number,

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from protocol.calls import (
+    NO_WARNINGS,
     Call,
     Configure,
     Describe,
@@ -19,6 +20,7 @@ from protocol.calls import (
     GetDiscreteOutputs,
     GetOutputs,
     GetRecordedVariables,
+    ModelWarnings,
     RecordedValues,
     Reply,
     SerializeState,
@@ -30,6 +32,7 @@ from protocol.description import (
     SlaveDescription,
 )
 from protocol.errors import DoublestepError, MalformedMessageError, ModelError
+from protocol.text.limits import cut
 from protocol.variables import StartValue
 from protocol.wire import checks
 from protocol.wire.descriptions import (
@@ -91,7 +94,10 @@ def _encoded(reply: Reply) -> bytes:
             numbers.append(float_buffer(result.numbers))
         else:
             shape.append(_plain(result))
-    return packed_with_block((PROTOCOL_VERSION, pack(shape)), numbers, (error, reply.compute_time))
+    rest: tuple[Any, ...] = (error, reply.compute_time)
+    if reply.warnings.number:
+        rest += ((reply.warnings.number, cut(reply.warnings.first)),)
+    return packed_with_block((PROTOCOL_VERSION, pack(shape)), numbers, rest)
 
 
 def _plain(result: object) -> Any:
@@ -137,9 +143,9 @@ def decode_reply(calls: Sequence[Call], data: bytes) -> Reply:
     if type(reply) is not list or not reply:
         raise MalformedMessageError(_REPLY_FORM)
     checks.check_version(reply[0])
-    if len(reply) != 5:
+    if not 5 <= len(reply) <= 6:
         raise MalformedMessageError(_REPLY_FORM)
-    _, shape, numbers, error, compute_time = reply
+    _, shape, numbers, error, compute_time, *warnings = reply
     shape, numbers = shape_and_numbers([shape, numbers], "a reply")
     kinds = tuple(map(type, calls))
     plan = _cached_reply_plan(shape, kinds) if is_cached(shape) else _reply_plan(shape, kinds)
@@ -147,10 +153,20 @@ def decode_reply(calls: Sequence[Call], data: bytes) -> Reply:
         plan.build(numbers, "a reply"),
         None if error is None else DoublestepError.from_reply(checks.mapping(error, "an error")),
         checks.number(compute_time, "compute_time"),
+        _warnings(warnings[0]) if warnings else NO_WARNINGS,
     )
 
 
-_REPLY_FORM: Final = "a reply must be [version, shape, numbers, error, compute_time]"
+def _warnings(value: Any) -> ModelWarnings:
+    if type(value) is not list or len(value) != 2:
+        raise MalformedMessageError("warnings must be [number, first]")
+    number, first = value
+    return ModelWarnings(checks.integer(number, "number"), checks.sentence(first, "first"))
+
+
+_REPLY_FORM: Final = (
+    "a reply must be [version, shape, numbers, error, compute_time], with or without warnings"
+)
 
 
 def _reply_plan(shape: bytes, kinds: tuple[type[Call], ...]) -> Plan:

@@ -16,6 +16,7 @@ from protocol.bus.bus import DEFAULT_ENDPOINT, Bus
 from protocol.bus.credentials import Credentials, Role
 from protocol.bus.endpoints import LOOPBACK, Endpoints, Mode
 from protocol.errors import DoublestepError
+from protocol.host.log_files import STANDARD_ERROR, LogOutput
 from protocol.host.logs import LogFormat, configure_logs
 from protocol.host.toml_text import assigned_values
 from protocol.text.references import split_reference
@@ -86,6 +87,7 @@ def serve(  # noqa: PLR0917  options of the command line
     ] = Path(),
     instance: Annotated[str, typer.Option(hidden=True)] = "",
     stay_with_parent: Annotated[bool, typer.Option(hidden=True)] = False,
+    log_file: Annotated[str, typer.Option(hidden=True)] = "",
     processor: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
     """Load MODEL and serve it until SIGTERM or Ctrl-C."""
@@ -108,7 +110,7 @@ def serve(  # noqa: PLR0917  options of the command line
         base.absolute(),
         key.name,
         assigned_values("--parameter", parameter or ()),
-        fmi_logging,
+        LogOutput(log_file or STANDARD_ERROR, log_format, ("*",) if fmi_logging else ()),
         state,
         log_format,
     )

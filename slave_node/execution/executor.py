@@ -147,11 +147,12 @@ class Executor:
         except Exception as exception:
             self._mode = mode
             error = self._failed(calls[len(results)], exception)
-            return Reply(results, error, perf_counter() - begin)
+            warnings = self._slave.take_warnings()
+            return Reply(results, error, perf_counter() - begin, warnings)
         finally:
             restore_floating_point()
         self._mode = mode
-        return Reply(results, None, perf_counter() - begin)
+        return Reply(results, None, perf_counter() - begin, self._slave.take_warnings())
 
     def close(self) -> None:
         """Free saved states and the slave, whatever they say to it. Idempotent."""

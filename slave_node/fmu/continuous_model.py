@@ -17,7 +17,8 @@ from protocol.signals import FloatArray
 from slave_node.fmu.exchange import Buffer
 from slave_node.fmu.fmi2 import Fmi2Instance
 from slave_node.fmu.fmi3 import MAX_UPDATES, Fmi3Instance
-from slave_node.fmu.instance import ADDRESS, DISCARD, FmuInstance
+from slave_node.fmu.instance import ADDRESS, FmuInstance
+from slave_node.fmu.log import DISCARD
 
 _VECTOR_CALL = [ADDRESS, ctypes.c_size_t]
 

@@ -23,15 +23,19 @@ from fmpy.fmi1 import (
 
 from protocol.calls import Initialize, RecordedValues, StepResult, StepStatus
 from protocol.errors import StepRejectedError
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.signals import FloatArray
 from protocol.variables import StartValue, VariableType
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer
 from slave_node.fmu.fmu_slave import FmuSlave
-from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, reference_array
+from slave_node.fmu.instance import FmuInstance, reference_array
 from slave_node.fmu.log import (
+    DISCARD,
+    ERROR,
     LOGGER_1,
+    WARNING,
     add_proxy,
     choose_categories,
     instantiating,
@@ -69,7 +73,7 @@ class Fmi1Instance(FmuInstance):
                 function.restype = ctypes.c_int
         return fmu
 
-    def _instantiate(self, *, log_all: bool) -> None:
+    def _instantiate(self) -> None:
         callbacks = fmi1CallbackFunctions()
         callbacks.logger = LOGGER_1
         callbacks.allocateMemory = fmi1CallbackAllocateMemoryTYPE(calloc)
@@ -80,7 +84,7 @@ class Fmi1Instance(FmuInstance):
         if self.fmu.component is None:
             raise RuntimeError("Failed to instantiate model")
         register(self.fmu.component, self.log)
-        choose_categories(self.fmu.setDebugLogging, log_all)
+        choose_categories(self.fmu.setDebugLogging, self.log.is_wanted)
 
     def c_name(self, name: str) -> str:
         """See `FmuInstance`: the names of FMI 1.0 begin with the model identifier."""
@@ -108,14 +112,14 @@ class Fmi1Slave(FmuSlave):
     Args:
         model: the FMU.
         name: instance name.
-        log_all: let the FMU log debug messages, not only its errors.
+        output: where its messages go; any category asked for stands for debug messages.
 
     Raises:
         ModelError: the FMU cannot be loaded or instantiated here.
     """
 
-    def __init__(self, model: FmuModel, name: str, *, log_all: bool = False) -> None:
-        self._fmi1 = Fmi1Instance(model, name, log_all=log_all)
+    def __init__(self, model: FmuModel, name: str, output: LogOutput = SILENT) -> None:
+        self._fmi1 = Fmi1Instance(model, name, output)
         super().__init__(self._fmi1)
         self._do_step = self._fmi1.function(
             "fmiDoStep", [ctypes.c_double, ctypes.c_double, ctypes.c_ubyte]
@@ -200,6 +204,8 @@ class Fmi1Slave(FmuSlave):
         status = self._do_step(communication_point, step_size, _NEW_STEP)
         restore_floating_point()
         if 0 <= status <= WARNING:
+            if status == WARNING:
+                self._fmi1.log.returned_warning("fmiDoStep")
             return StepResult(StepStatus.OK, communication_point + step_size)
         if status == DISCARD:
             return StepResult(StepStatus.DISCARD, self._last_successful_time())

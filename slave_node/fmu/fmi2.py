@@ -17,19 +17,22 @@ from fmpy.fmi2 import (
 
 from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.errors import StepRejectedError
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.variables import VariableType
 from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL, ExchangeBuffer
 from slave_node.fmu.fmu_slave import FmuSlave
-from slave_node.fmu.instance import DISCARD, ERROR, WARNING, FmuInstance, reference_array
+from slave_node.fmu.instance import FmuInstance, reference_array
 from slave_node.fmu.log import (
+    DISCARD,
+    ERROR,
     LOGGER_2,
+    WARNING,
     add_proxy,
     choose_categories,
     register,
     unregister,
-    wanted_categories,
 )
 from slave_node.fmu.values import ValueType
 
@@ -59,8 +62,8 @@ class Fmi2Instance(FmuInstance):
     def _fmpy_class(self) -> Callable[..., Any]:
         return FMU2Slave  # type: ignore[no-any-return]
 
-    def _instantiate(self, *, log_all: bool) -> None:
-        wanted = wanted_categories(list(self.model.log_categories), log_all=log_all)
+    def _instantiate(self) -> None:
+        wanted = self.log.wanted_categories(self.model.log_categories)
         callbacks = fmi2CallbackFunctions()
         callbacks.logger = LOGGER_2
         callbacks.componentEnvironment = id(self.log)
@@ -69,7 +72,7 @@ class Fmi2Instance(FmuInstance):
         add_proxy(callbacks)
         register(id(self.log), self.log)
         try:
-            self.fmu.instantiate(callbacks=callbacks, loggingOn=log_all or bool(wanted))
+            self.fmu.instantiate(callbacks=callbacks, loggingOn=self.log.is_wanted or bool(wanted))
             if wanted:
                 choose_categories(self.fmu.setDebugLogging, True, wanted)
         except Exception:
@@ -115,14 +118,14 @@ class Fmi2Slave(FmuSlave):
     Args:
         model: the FMU.
         name: instance name.
-        log_all: let the FMU log all its categories, not only its errors.
+        output: where its messages go, and which ones it is asked for.
 
     Raises:
         ModelError: the FMU cannot be loaded or instantiated here.
     """
 
-    def __init__(self, model: FmuModel, name: str, *, log_all: bool = False) -> None:
-        self._fmi2 = Fmi2Instance(model, name, log_all=log_all)
+    def __init__(self, model: FmuModel, name: str, output: LogOutput = SILENT) -> None:
+        self._fmi2 = Fmi2Instance(model, name, output)
         super().__init__(self._fmi2)
         function = self._fmi2.function
         self._do_step = function("fmi2DoStep", [ctypes.c_double, ctypes.c_double, ctypes.c_int])
@@ -154,6 +157,8 @@ class Fmi2Slave(FmuSlave):
         status = self._do_step(communication_point, step_size, no_set_state_prior)
         restore_floating_point()
         if 0 <= status <= WARNING:
+            if status == WARNING:
+                self._fmi2.log.returned_warning("fmi2DoStep")
             return StepResult(_STEP_OK, communication_point + step_size)
         if status == DISCARD:
             return self._discarded()

@@ -12,6 +12,7 @@ from fmpy.fmi3 import FMU3Slave
 
 from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.errors import SlaveError, StepRejectedError
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.signals import FloatArray
 from protocol.step_sums import step_to
 from protocol.variables import StartValue, VariableType
@@ -20,8 +21,8 @@ from slave_node.fmu.archive import PLATFORM_FOLDERS
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.exchange import VALUES_CALL_3, ArrayExchangeBuffer, InputPolynomials
 from slave_node.fmu.fmu_slave import FmuSlave
-from slave_node.fmu.instance import ADDRESS, DISCARD, ERROR, WARNING, FmuInstance
-from slave_node.fmu.log import FmuLog, choose_categories, wanted_categories
+from slave_node.fmu.instance import ADDRESS, FmuInstance
+from slave_node.fmu.log import DISCARD, ERROR, WARNING, FmuLog, choose_categories
 from slave_node.fmu.saved_state import SavedState, pack, unpack
 from slave_node.fmu.times import is_at_border, is_within, meet
 from slave_node.fmu.values import ValueType
@@ -63,17 +64,18 @@ class Fmi3Instance(FmuInstance):
         VariableType.BINARY: ValueType("Binary", ctypes.c_void_p),
     }
 
-    def __init__(self, model: FmuModel, name: str, *, log_all: bool = False) -> None:
+    def __init__(self, model: FmuModel, name: str, output: LogOutput = SILENT) -> None:
         self.next_event_time = math.inf
-        super().__init__(model, name, log_all=log_all)
+        super().__init__(model, name, output)
 
     @property
     def _fmpy_class(self) -> Callable[..., Any]:
         return FMU3Slave  # type: ignore[no-any-return]
 
-    def _instantiate(self, *, log_all: bool) -> None:
-        wanted = wanted_categories(list(self.model.log_categories), log_all=log_all)
-        self._instantiate_interface(loggingOn=log_all or bool(wanted), logMessage=_logger(self.log))
+    def _instantiate(self) -> None:
+        wanted = self.log.wanted_categories(self.model.log_categories)
+        is_on = self.log.is_wanted or bool(wanted)
+        self._instantiate_interface(loggingOn=is_on, logMessage=_logger(self.log))
         if wanted:
             choose_categories(self.fmu.setDebugLogging, True, wanted)
 
@@ -133,8 +135,8 @@ class Fmi3Instance(FmuInstance):
 
 
 def _logger(log: FmuLog) -> Callable[..., None]:
-    def receive(_environment: Any, _status: int, category: bytes, text: bytes) -> None:
-        log.add(category, text)
+    def receive(_environment: Any, status: int, category: bytes, text: bytes) -> None:
+        log.add(status, category, text)
 
     return receive
 
@@ -146,12 +148,11 @@ class _SlaveInstance(Fmi3Instance):
         self,
         model: FmuModel,
         name: str,
-        *,
-        log_all: bool,
+        output: LogOutput,
         intermediate_update: Callable[..., None],
     ) -> None:
         self._intermediate_update = intermediate_update
-        super().__init__(model, name, log_all=log_all)
+        super().__init__(model, name, output)
 
     def _instantiate_interface(self, **arguments: Any) -> None:
         interface = self.model.interface
@@ -174,7 +175,7 @@ class Fmi3Slave(FmuSlave):
     Args:
         model: the FMU.
         name: instance name.
-        log_all: let the FMU log all its categories, not only its errors.
+        output: where its messages go, and which ones it is asked for.
 
     Raises:
         ModelError: the FMU cannot be loaded or instantiated here.
@@ -182,11 +183,9 @@ class Fmi3Slave(FmuSlave):
 
     _inputs: ArrayExchangeBuffer
 
-    def __init__(self, model: FmuModel, name: str, *, log_all: bool = False) -> None:
+    def __init__(self, model: FmuModel, name: str, output: LogOutput = SILENT) -> None:
         self._failure: Exception | None = None
-        self._fmi3 = _SlaveInstance(
-            model, name, log_all=log_all, intermediate_update=self._intermediate_update
-        )
+        self._fmi3 = _SlaveInstance(model, name, output, self._intermediate_update)
         super().__init__(self._fmi3)
         self._has_event_mode = model.interface.has_event_mode
         self._event, self._end, self._early = (ctypes.c_bool() for _ in range(3))
@@ -340,7 +339,9 @@ class Fmi3Slave(FmuSlave):
         if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure
-        if status > WARNING or status < 0:
+        if status == WARNING:
+            self._fmi3.log.returned_warning("fmi3DoStep")
+        elif status:
             if status == DISCARD:
                 return StepResult(StepStatus.DISCARD, self._reached.value)
             if status == ERROR:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 
-from protocol.calls import RecordedValues
+from protocol.calls import ModelWarnings, RecordedValues
 from protocol.description import SlaveDescription
 from protocol.errors import SlaveError
 from protocol.signals import MAX_ORDER, FloatArray
@@ -114,6 +114,10 @@ class FmuSlave(Slave):
     def get_discrete_outputs(self) -> tuple[StartValue, ...]:
         """See `Slave`."""
         return self._discrete_outputs.receive()
+
+    def take_warnings(self) -> ModelWarnings:
+        """See `Slave`."""
+        return self._instance.log.take_warnings()
 
     def record(self, names: Sequence[str]) -> None:
         """See `Slave`.

@@ -18,6 +18,7 @@ import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from protocol.errors import FatalSlaveError, ModelError, SlaveError
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.text.names import nearest
 from protocol.values import value_of
 from protocol.variables import StartValue, Variable, VariableType
@@ -25,14 +26,10 @@ from slave_node.floating_point import restore_floating_point
 from slave_node.fmu.archive import PLATFORM_FOLDERS, check_binary
 from slave_node.fmu.description import FmuModel
 from slave_node.fmu.embedded_python import forget_modules, own_modules
-from slave_node.fmu.log import FmuLog
+from slave_node.fmu.log import FATAL, OK, STATUS, WARNING, FmuLog
 from slave_node.fmu.values import DiscreteExchange, ValueType
 from slave_node.fmu.variables import Place, settable_variable
 
-OK, WARNING, DISCARD, ERROR, FATAL = range(5)
-"""The numbers of the statuses, the same in all versions."""
-
-_STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 _MISSING_LIBRARY = re.compile(r"([^\s:]+): cannot open shared object file")
 
 ADDRESS = ctypes.c_void_p
@@ -49,13 +46,13 @@ class FmuInstance(ABC):
     Args:
         model: the FMU.
         name: of the instance.
-        log_all: let the FMU log all its categories, not only its errors.
+        output: where its messages go, and which ones it is asked for.
 
     Attributes:
         model: the FMU.
         fmu: fmpy's object for it.
         component: its address.
-        log: its last messages.
+        log: its messages.
 
     Raises:
         ModelError: the FMU cannot be loaded or instantiated here.
@@ -68,9 +65,9 @@ class FmuInstance(ABC):
     state_functions: ClassVar[tuple[str, str, str]] = ("", "", "")
     """Names of those that get, set and free a state."""
 
-    def __init__(self, model: FmuModel, name: str, *, log_all: bool = False) -> None:
+    def __init__(self, model: FmuModel, name: str, output: LogOutput = SILENT) -> None:
         self.model = model
-        self.log = FmuLog()
+        self.log = FmuLog(name, output, self.prefix)
         self.fmu: Any = None
         self._is_fatal = False
         check_binary(
@@ -84,7 +81,7 @@ class FmuInstance(ABC):
         self.fmu = self._load(name)
         try:
             with own_modules(model.fmu, model.directory):
-                self._instantiate(log_all=log_all)
+                self._instantiate()
         except ModelError:
             raise
         except Exception as error:  # fmpy raises plain exceptions for all that can go wrong
@@ -108,7 +105,7 @@ class FmuInstance(ABC):
         """Fmpy's class for the interface."""
 
     @abstractmethod
-    def _instantiate(self, *, log_all: bool) -> None:
+    def _instantiate(self) -> None:
         """Call fmiXInstantiate..., with the log connected."""
 
     @abstractmethod
@@ -199,10 +196,12 @@ class FmuInstance(ABC):
     def check(self, function: str, status: int, *, remedy: str = "") -> None:
         """Turn any status that is not OK or a warning into an error with the FMU's own words."""
         restore_floating_point()
+        if status == WARNING:
+            self.log.returned_warning(function)
         if status in (OK, WARNING):
             return
-        known = 0 <= status < len(_STATUS)
-        name = f"{self.prefix}{_STATUS[status]}" if known else f"status {status}"
+        known = 0 <= status < len(STATUS)
+        name = f"{self.prefix}{STATUS[status]}" if known else f"status {status}"
         text = self.log.explain(f"{function} returned {name}")
         self._is_fatal = self._is_fatal or status == FATAL
         raise FatalSlaveError(text) if status == FATAL else SlaveError(text, remedy=remedy)

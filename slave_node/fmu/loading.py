@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from protocol.errors import ModelError
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.slave import Slave
 from protocol.variables import StartValue
 from slave_node.fmu.description import FmuModel, read_fmu
@@ -19,7 +20,7 @@ def load_fmu(
     directory: Path,
     name: str,
     *,
-    log_all: bool = False,
+    output: LogOutput = SILENT,
     structural_parameters: Mapping[str, StartValue] | None = None,
 ) -> Slave:
     """The slave for an FMU.
@@ -28,7 +29,7 @@ def load_fmu(
         fmu: the file, or the folder of one that is unpacked.
         directory: an empty directory to extract it into; the caller removes it.
         name: instance name.
-        log_all: let the FMU log all its categories, not only its errors.
+        output: where its messages go, and which ones it is asked for.
         structural_parameters: values that hold instead of the start values (FMI 3.0).
 
     Raises:
@@ -37,14 +38,14 @@ def load_fmu(
     """
     model = read_fmu(fmu, directory, structural_parameters)
     if model.interface.is_model_exchange:
-        return _model_exchange(model, name, log_all=log_all)
-    return _CO_SIMULATION[model.interface.version](model, name, log_all=log_all)
+        return _model_exchange(model, name, output)
+    return _CO_SIMULATION[model.interface.version](model, name, output)
 
 
 _CO_SIMULATION: Mapping[int, Callable[..., Slave]] = {1: Fmi1Slave, 2: Fmi2Slave, 3: Fmi3Slave}
 
 
-def _model_exchange(model: FmuModel, name: str, *, log_all: bool) -> Slave:
+def _model_exchange(model: FmuModel, name: str, output: LogOutput) -> Slave:
     try:
         from slave_node.fmu import model_exchange  # noqa: PLC0415  others need no SUNDIALS
     except OSError as error:
@@ -53,4 +54,4 @@ def _model_exchange(model: FmuModel, name: str, *, log_all: bool) -> Slave:
             f"this platform: {error}",
             remedy="export it as co-simulation",
         ) from error
-    return model_exchange.ADAPTERS[model.interface.version](model, name, log_all=log_all)
+    return model_exchange.ADAPTERS[model.interface.version](model, name, output)

@@ -1,20 +1,44 @@
-"""The last messages of an FMU, which explain its errors."""
+"""Messages of an FMU: where they are written, which ones it gives, and what explains its errors."""
 
 from __future__ import annotations
 
 import ctypes
+import logging
+import sys
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Any
 
 from fmpy.fmi1 import FMICallException, fmi1CallbackLoggerTYPE
 from fmpy.fmi2 import fmi2CallbackLoggerTYPE
 from fmpy.logging import addLoggerProxy
 
+from protocol.calls import NO_WARNINGS, ModelWarnings
+from protocol.errors import ModelError
+from protocol.host.log_files import (
+    NOWHERE,
+    SILENT,
+    STANDARD_ERROR,
+    LogFileHandler,
+    LogOutput,
+    append,
+)
+from protocol.host.logs import formatter
+from protocol.text.names import nearest
+
 _LINES = 20
 _SHOWN = 5
-_FATAL = 4
+_LENGTH = 2000
+"""Characters of a message that are kept."""
+
+STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
+OK, WARNING, DISCARD, ERROR, FATAL = range(5)
+"""The numbers of the statuses, the same in all versions."""
+
+_LEVELS = {WARNING: logging.WARNING, ERROR: logging.ERROR, FATAL: logging.CRITICAL}
 UNNAMED = ""
 _ERROR_CATEGORIES = {
     *("logStatusWarning", "logStatusDiscard", "logStatusError", "logStatusFatal"),
@@ -23,17 +47,51 @@ _ERROR_CATEGORIES = {
 
 
 class FmuLog:
-    """The last messages of one FMU."""
+    """The messages of one FMU.
 
-    def __init__(self) -> None:
+    Args:
+        name: of the slave.
+        output: where they go.
+        prefix: of FMI's names, such as ``fmi2``.
+    """
+
+    def __init__(self, name: str, output: LogOutput = SILENT, prefix: str = "fmi") -> None:
+        self.output = output
+        self._prefix = prefix
         self._lines: deque[str] = deque(maxlen=_LINES)
+        self._warnings = NO_WARNINGS
+        self._logger = _logger(name, output)
 
-    def add(self, category: bytes | None, text: bytes | None) -> None:
-        """Keep a message."""
-        self._lines.append(
-            f"[{(category or b'').decode(errors='replace')}] "
-            f"{(text or b'').decode(errors='replace').strip()}"
-        )
+    def add(self, status: int, category: bytes | None, text: bytes | None) -> None:
+        """Keep a message, and write it down."""
+        words = (text or b"").decode(errors="replace").strip()[:_LENGTH]
+        line = f"[{(category or b'').decode(errors='replace')[:_LENGTH]}] {words}"
+        self._lines.append(line)
+        known = 0 <= status < len(STATUS)
+        name = f"{self._prefix}{STATUS[status]}" if known else f"status {status}"
+        if self._logger is not None:
+            self._logger.log(_LEVELS.get(status, logging.INFO), "%s %s", name, line)
+        if status == WARNING:
+            self._warned(words)
+
+    def returned_warning(self, function: str) -> None:
+        """Note that a function returned the status Warning."""
+        text = f"{function} returned {self._prefix}Warning"
+        if self._logger is not None:
+            self._logger.warning("%s", text)
+        self._warned(text)
+
+    def _warned(self, text: str) -> None:
+        if self.output.warnings:
+            with suppress(OSError):
+                append(self.output.warnings, " ".join(text.split()))
+        else:
+            self._warnings = self._warnings.after(text)
+
+    def take_warnings(self) -> ModelWarnings:
+        """Warnings since the last call."""
+        taken, self._warnings = self._warnings, NO_WARNINGS
+        return taken
 
     def explain(self, text: str) -> str:
         """``text`` with the last messages behind it, which are used up by that."""
@@ -41,10 +99,43 @@ class FmuLog:
         self._lines.clear()
         return f"{text}; the FMU's log: {lines}" if lines else text
 
+    @property
+    def is_wanted(self) -> bool:
+        """True if messages are asked for beyond those of warnings and errors."""
+        return bool(self.output.categories)
 
-def wanted_categories(names: list[str], *, log_all: bool) -> list[str]:
-    """Those of an FMU's log categories that are asked for: all, or those of its errors."""
-    return [name for name in names if log_all or name in _ERROR_CATEGORIES]
+    def wanted_categories(self, names: Sequence[str]) -> list[str]:
+        """Those of an FMU's log categories that are asked for.
+
+        Raises:
+            ModelError: a pattern fits none of them.
+        """
+        patterns = self.output.categories
+        if not patterns:
+            return [name for name in names if name in _ERROR_CATEGORIES]
+        for pattern in patterns:
+            if names and not any(fnmatchcase(name, pattern) for name in names):
+                raise ModelError(
+                    f"it has no log category {pattern!r}{nearest(pattern, names)}; it has "
+                    f"{', '.join(names)}",
+                    remedy='correct fmi_logging; ["*"] stands for all',
+                )
+        return [name for name in names if any(fnmatchcase(name, p) for p in patterns)]
+
+
+def _logger(name: str, output: LogOutput) -> logging.Logger | None:
+    """A logger of this FMU alone, whatever loggers its process has."""
+    if output.file == NOWHERE:
+        return None
+    handler: logging.Handler
+    if output.file == STANDARD_ERROR:
+        handler = logging.StreamHandler(sys.stderr)
+    else:
+        handler = LogFileHandler(Path(output.file))
+    handler.setFormatter(formatter(output.style, f"%(asctime)s {name}: %(message)s", slave=name))
+    logger = logging.Logger("slave_node.fmu", logging.INFO)
+    logger.addHandler(handler)
+    return logger
 
 
 def choose_categories(choose: Callable[..., object], *arguments: object) -> None:
@@ -56,7 +147,7 @@ def choose_categories(choose: Callable[..., object], *arguments: object) -> None
     try:
         choose(*arguments)
     except FMICallException as error:
-        if error.status == _FATAL:
+        if error.status == FATAL:
             raise
 
 
@@ -70,7 +161,7 @@ _instantiating: list[FmuLog] = []
 
 
 def _receive(
-    environment: int | None, _name: bytes, _status: int, category: bytes, text: bytes
+    environment: int | None, _name: bytes, status: int, category: bytes, text: bytes
 ) -> None:
     log = _logs.get(environment or 0)
     if log is None and _instantiating:
@@ -78,7 +169,7 @@ def _receive(
     elif log is None and len(_logs) == 1:  # an FMU that forgets its environment
         (log,) = _logs.values()
     if log is not None:
-        log.add(category, text)
+        log.add(status, category, text)
 
 
 LOGGER_2 = fmi2CallbackLoggerTYPE(_receive)

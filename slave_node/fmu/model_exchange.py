@@ -14,6 +14,7 @@ import numpy as np
 
 from protocol.calls import Initialize, StepResult, StepStatus
 from protocol.errors import SlaveError, StepRejectedError
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.signals import FloatArray
 from protocol.slave import Slave
 from protocol.variables import StartValue
@@ -344,11 +345,11 @@ class ModelExchangeSlave(FmuSlave):
 
 
 def _adapter(instance: type[ContinuousModel]) -> Callable[..., Slave]:
-    def load(model: FmuModel, name: str, *, log_all: bool = False) -> Slave:
-        return ModelExchangeSlave(instance(model, name, log_all=log_all))
+    def load(model: FmuModel, name: str, output: LogOutput = SILENT) -> Slave:
+        return ModelExchangeSlave(instance(model, name, output))
 
     return load
 
 
 ADAPTERS: Mapping[int, Callable[..., Slave]] = {2: _adapter(Fmi2Model), 3: _adapter(Fmi3Model)}
-"""By major version of FMI: from the FMU, an instance name and ``log_all`` to the slave."""
+"""By major version of FMI: from the FMU, a name and the output of its log to the slave."""

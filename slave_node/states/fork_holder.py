@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import json
 import os
 import signal
 import socket
@@ -19,6 +20,8 @@ from typing import NoReturn
 
 from protocol.calls import Configure, Reply
 from protocol.errors import DoublestepError, SlaveError
+from protocol.host.log_files import LogOutput
+from protocol.host.logs import LogFormat
 from protocol.host.standard_error import forgive_models
 from protocol.slave import CallExecutor, Slave
 from protocol.wire.programs import decode_program
@@ -68,9 +71,14 @@ def _load(message: bytes) -> Slave:
         Path(str(what["base"])),
         str(what["name"]),
         Path(str(what["scratch"])),
-        log_all=bool(what["log_all"]),
+        output=_output(str(what["output"])),
         configuration=configuration,
     )
+
+
+def _output(text: str) -> LogOutput:
+    file, style, categories, warnings = json.loads(text)
+    return LogOutput(file, LogFormat(style), tuple(categories), warnings)
 
 
 def _execute(executor: CallExecutor, program: bytes) -> bytes:

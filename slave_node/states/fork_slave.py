@@ -13,6 +13,7 @@ Copies make that expensive, so that there are as few as can be, and at the best 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -29,6 +30,7 @@ from protocol.calls import (
     GetOutputs,
     GetRecordedVariables,
     Initialize,
+    ModelWarnings,
     RecordedValues,
     Reset,
     SetDiscreteInputs,
@@ -45,6 +47,7 @@ from protocol.errors import (
     SlaveKilledError,
     StepRejectedError,
 )
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.signals import FloatArray
 from protocol.slave import Slave
 from protocol.variables import StartValue
@@ -58,6 +61,7 @@ from slave_node.states.fork_trail import START, Task, Trail
 from slave_node.states.held_process import HeldProcess, refusal
 from slave_node.states.repeating import RepeatingPart
 from slave_node.states.step_message import decode_stepped, encode_step
+from slave_node.states.warnings_file import WarningsFile
 
 _CLOSE_TIME = 0.5
 
@@ -70,7 +74,7 @@ class HeldModel:
     base: Path
     name: str
     scratch: Path
-    log_all: bool = False
+    output: LogOutput = SILENT
     configuration: Configure = field(default_factory=Configure)
 
 
@@ -115,6 +119,7 @@ class ForkSlave(Slave):
         self._saved: set[_State] = set()
         self._habits = Habits()
         self._recorded_names: tuple[str, ...] = ()
+        self._warnings = WarningsFile(model.scratch / "warnings")
         self._load()
 
     def _load(self) -> None:
@@ -146,7 +151,7 @@ class ForkSlave(Slave):
                 "base": str(model.base),
                 "name": model.name,
                 "scratch": str(scratch),
-                "log_all": model.log_all,
+                "output": json.dumps(model.output._replace(warnings=str(self._warnings.path))),
                 "configuration": encode_program([model.configuration]),
             }
         )
@@ -357,6 +362,10 @@ class ForkSlave(Slave):
         assert isinstance(values, RecordedValues)
         return values
 
+    def take_warnings(self) -> ModelWarnings:
+        """See `Slave`."""
+        return self._warnings.take()
+
     def terminate(self) -> None:
         """See `Slave`."""
         self._run(Terminate())
@@ -385,6 +394,7 @@ class ForkSlave(Slave):
         self._free_all()
         self._drop_active()
         self._family.close()
+        self._warnings.close()
 
     # ---- Saved states -------------------------------------------------------------------------
 

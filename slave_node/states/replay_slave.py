@@ -150,7 +150,7 @@ class ReplaySlave(WrappedSlave):
         executor = Executor(self._slave)
         calls = record.calls()
         while some := list(islice(calls, _CALLS_AT_ONCE)):
-            results, error, _ = executor.execute(some)
+            results, error, *_ = executor.execute(some)
             if error is not None:
                 raise _did_not_repeat(some[len(results)], error.cause)
             last = results[-1]

@@ -32,6 +32,7 @@ from protocol.errors import (
     SlaveCrashedError,
     SlaveKilledError,
 )
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.host.logs import LogFormat, configure_logs
 from protocol.host.python_processes import restore_path, safe_path
 from protocol.host.scratch import ScratchDirectory
@@ -56,14 +57,15 @@ class ModelReference:
     """Reference to a model to load, see `slave_node.loading.load_executor`.
 
     ``parameters`` are start values that hold unless the master gives others, ``state_kind`` holds
-    unless it asks for another; ``log_format`` is that of the worker's messages.
+    unless it asks for another; ``output`` is for the messages of an FMU, ``log_format`` that of the
+    worker's.
     """
 
     model: str
     base: Path
     name: str
     parameters: Mapping[str, StartValue] = field(default_factory=dict)
-    log_all: bool = False
+    output: LogOutput = SILENT
     state_kind: str = ""
     log_format: LogFormat = LogFormat.TEXT
 
@@ -311,7 +313,7 @@ def _hold(end: socket.socket, reference: ModelReference, scratch: str) -> None:
             reference.base,
             reference.name,
             Path(scratch),
-            log_all=reference.log_all,
+            output=reference.output,
             state_kind=reference.state_kind,
         )
     except DoublestepError as error:

@@ -63,7 +63,7 @@ typedef struct Step {
     double reached;     /* s; out, t + h beforehand */
     bool event;         /* out: an event at `reached` is to be handled before the next step */
     bool terminate;     /* out: the FMU wants the simulation to end at `reached` */
-    const char *reason; /* out, unless the step is taken */
+    const char *reason; /* out; of a step that is taken: a warning, or NULL */
 
     bool stop_at_events; /* false: handle them on the way */
 

@@ -35,7 +35,7 @@ Status report(const Instance *instance, Status status, const char *function, con
 {
     char text[512];
     va_list arguments;
-    if (!instance->log || (status != ERROR && !instance->logs_all))
+    if (!instance->log || (status == DISCARD && !instance->logs_all))
         return status;
     const int n = snprintf(text, sizeof text, "%s: ", function);
     va_start(arguments, format);
@@ -573,5 +573,5 @@ Status take_step(Instance *instance, const char *function, Step *step)
                       step->reason);
     }
     standing->time = step->reached;
-    return OK;
+    return step->reason ? report(instance, WARNING, function, "%s", step->reason) : OK;
 }

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from protocol import errors as errors_module
 from protocol.calls import (
     CALLS,
+    NO_WARNINGS,
     Call,
     Configure,
     Describe,
@@ -31,6 +32,7 @@ from protocol.calls import (
     GetRecordedVariables,
     GetState,
     Initialize,
+    ModelWarnings,
     RecordedValues,
     Reply,
     Reset,
@@ -128,6 +130,7 @@ calls = st.one_of(
         st.none() | any_float,
         numbers,
         numbers,
+        st.lists(texts, max_size=3).map(tuple),
         st.lists(texts, max_size=3).map(tuple),
     ),
     st.builds(Reset, st.booleans()),
@@ -260,7 +263,8 @@ def conversations(draw: st.DrawFn) -> tuple[list[Call], Reply]:
     program = draw(st.lists(calls, min_size=1, max_size=4))
     done = draw(st.integers(0, len(program)))
     results = [draw(results_of(call)) for call in program[:done]]
-    return program, Reply(results, draw(st.none() | errors), draw(any_float))
+    warnings = st.just(NO_WARNINGS) | st.builds(ModelWarnings, st.integers(1, 9), texts)
+    return program, Reply(results, draw(st.none() | errors), draw(any_float), draw(warnings))
 
 
 def canonical(value: Any) -> Any:

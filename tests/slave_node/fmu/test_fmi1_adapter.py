@@ -14,6 +14,7 @@ import pytest
 from protocol.calls import Initialize, StepStatus
 from protocol.description import InputDerivatives, StateKind
 from protocol.errors import ModelError, SlaveError, StepRejectedError
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.signals import InputSignal
 from protocol.slave import Slave
 from protocol.variables import Causality, StartValue
@@ -30,10 +31,10 @@ def load(capability_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
     """``load(model)`` instantiates an FMU, by name or from another file; freed after the test."""
     slaves: list[Slave] = []
 
-    def make(model: str | Path, *, log_all: bool = False) -> Slave:
+    def make(model: str | Path, output: LogOutput = SILENT) -> Slave:
         fmu = capability_dir / f"{model}.fmu" if isinstance(model, str) else model
         scratch = tmp_path_factory.mktemp("scratch")
-        slaves.append(load_fmu(fmu, scratch, fmu.stem, log_all=log_all))
+        slaves.append(load_fmu(fmu, scratch, fmu.stem, output=output))
         return slaves[-1]
 
     yield make

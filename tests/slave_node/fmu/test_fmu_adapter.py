@@ -29,6 +29,7 @@ from protocol.calls import (
 )
 from protocol.errors import ModelError, SlaveError, StepRejectedError
 from protocol.host.archives import MAX_ENTRIES
+from protocol.host.log_files import SILENT, LogOutput
 from protocol.signals import InputSignal
 from protocol.slave import Slave
 from protocol.variables import Causality, VariableType
@@ -54,10 +55,10 @@ def load(fmu_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lo
     """``load(model)`` instantiates an FMU, by name or from another file; freed after the test."""
     slaves: list[Slave] = []
 
-    def make(model: str | Path, *, log_all: bool = False) -> Slave:
+    def make(model: str | Path, output: LogOutput = SILENT) -> Slave:
         fmu = fmu_dir / f"{model}.fmu" if isinstance(model, str) else model
         scratch = tmp_path_factory.mktemp("scratch")
-        slaves.append(load_fmu(fmu, scratch, fmu.stem, log_all=log_all))
+        slaves.append(load_fmu(fmu, scratch, fmu.stem, output=output))
         return slaves[-1]
 
     yield make
@@ -221,7 +222,7 @@ def test_every_fmu_keeps_its_own_log(load: Load) -> None:
 
 def test_all_categories_are_logged_on_demand(fmu_dir: Path, tmp_path: Path, load: Load) -> None:
     """An FMU that cannot be instantiated says why, and a warning is no error."""
-    start(load("wheel", log_all=True), tolerance=1e-18)
+    start(load("wheel", LogOutput(categories=("*",))), tolerance=1e-18)
     fmu = changed(fmu_dir, tmp_path / "wheel.fmu", ('guid="{', 'guid="{0'))
     with pytest.raises(ModelError, match=r"fmi2Instantiate: .*; the FMU's log: .*guid"):
         load(fmu)

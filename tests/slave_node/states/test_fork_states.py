@@ -291,7 +291,11 @@ def test_freed_states_and_closed_slaves_leave_no_process(fmu_dir: Path) -> None:
     ],
 )
 def test_nothing_leaks(fmu_dir: Path, kind: str, cycles: int) -> None:
-    """Save, step, restore, step, free: memory, descriptors and processes stay as they are."""
+    """Save, step, restore, step, free: memory, descriptors and processes stay as they are.
+
+    But for what CPython leaves behind with each fork, the locks of before: half a KiB.
+    """
+    left_by_forks = 1024 * cycles if kind == "fork" else 0
 
     def measure() -> tuple[int, list[int], int]:
         processes = [psutil.Process(), *family()]
@@ -323,7 +327,7 @@ def test_nothing_leaks(fmu_dir: Path, kind: str, cycles: int) -> None:
         after = measure()
     assert before is not None
     assert after[:2] == before[:2]
-    assert after[2] - before[2] < 2 * 2**20
+    assert after[2] - before[2] < 2 * 2**20 + left_by_forks
 
 
 @pytest.fixture
