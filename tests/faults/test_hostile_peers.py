@@ -119,7 +119,9 @@ def test_many_masters_on_one_bus(start: Commands, tmp_path: Path, endpoint: str)
     file = system_file(tmp_path, simulation=SHORT, bus=bus)
     outs = [tmp_path / f"out{number}" for number in range(4)]
     words = ("--no-plot", "--timeout", "120")
-    masters = [start("master_node", "run", file, "--output", out, *words) for out in outs]
+    masters = [
+        start("master_node", "run", file, "--no-plot", "--output", out, *words) for out in outs
+    ]
     for master in masters:
         assert master.wait(BOUND) == 0, master.text
     simulate(load_system(file), output=tmp_path / "whole", in_process=True)

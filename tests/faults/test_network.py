@@ -104,7 +104,7 @@ def test_a_cut_cable_is_ridden_out(start: Commands, hosts: Hosts, tmp_path: Path
     )
     file = system_file(tmp_path, None, simulation=SIMULATION)
     master = start(
-        *("master_node", "run", file, "--listen", where, "--insecure"),
+        *("master_node", "run", file, "--no-plot", "--listen", where, "--insecure"),
         *("--output", tmp_path / "out"),
         on=hosts.prefix("master"),
     )
@@ -131,7 +131,7 @@ def test_a_cable_that_stays_cut_ends_the_run(start: Commands, hosts: Hosts, tmp_
     slave.wait_for("ready")
     file = system_file(tmp_path, None, simulation=SIMULATION, bus="reconnect_time = 0.5\n")
     master = start(
-        *("master_node", "run", file, "--connect", where, "--insecure"),
+        *("master_node", "run", file, "--no-plot", "--connect", where, "--insecure"),
         *("--output", tmp_path / "out"),
         on=hosts.prefix("master"),
     )
@@ -176,7 +176,7 @@ def test_a_router_between_all_and_its_restart(
         bus=f'mode = "client"\nconnect = ["{endpoint}"]\n',
         chassis_parameters=nap(tmp_path) if launched else None,
     )
-    master = start("master_node", "run", file, "--output", tmp_path / "out")
+    master = start("master_node", "run", file, "--no-plot", "--output", tmp_path / "out")
     wait_until((tmp_path / "asleep").exists)
     router.send(signal.SIGKILL)
     router.wait()
@@ -205,7 +205,7 @@ def test_a_cut_behind_a_router(start: Commands, hosts: Hosts, tmp_path: Path) ->
     )
     file = system_file(tmp_path, None, simulation=SIMULATION)
     master = start(
-        *("master_node", "run", file, "--output", tmp_path / "out", *through),
+        *("master_node", "run", file, "--no-plot", "--output", tmp_path / "out", *through),
         on=hosts.prefix("master"),
     )
     wait_until((tmp_path / "asleep").exists)
@@ -259,7 +259,8 @@ def test_no_router(start: Commands, tmp_path: Path, endpoint: str) -> None:
     slave = start("slave_node", "serve", *chassis_words(tmp_path), *through)
     file = system_file(tmp_path, None, simulation=SIMULATION)
     master = start(
-        *("master_node", "run", file, "--output", tmp_path / "out", "--timeout", "1"), *through
+        *("master_node", "run", file, "--no-plot", "--output", tmp_path / "out", "--timeout", "1"),
+        *through,
     )
     assert master.wait() == 3
     assert f"connect: no connection to {endpoint} within 1 s; start the router" in master.text

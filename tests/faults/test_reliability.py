@@ -29,6 +29,7 @@ from tests.faults.test_processes import (
     system_file,
     worker_of,
 )
+from tests.support.slow import quick_at
 from tests.support.waiting import BOUND, wait_until
 
 __all__ = ["command", "start"]  # the fixtures
@@ -106,7 +107,7 @@ def test_a_slave_stopped_for_ever_ends_the_run(  # noqa: PLR0917
         simulation=FOREVER + 'recovery = "off"\n',
         bus=bus,
     )
-    master = start("master_node", "run", file, "--output", tmp_path / "out")
+    master = start("master_node", "run", file, "--no-plot", "--output", tmp_path / "out")
     master.wait_for("simulating")
     wait_until(lambda: has_stepped(tmp_path / "out"))
     node = slave_processes(master)["wheel"]
@@ -251,7 +252,7 @@ class Stubborn(Model):
 '''
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", quick_at([signal.SIGINT], [signal.SIGINT, signal.SIGTERM]))
 def test_a_second_ctrl_c_kills(number: signal.Signals, start: Start, tmp_path: Path) -> None:
     """When the first one cannot end the run, as a model in process swallows it, the second does."""
     (tmp_path / "stubborn.py").write_text(STUBBORN)

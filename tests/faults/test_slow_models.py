@@ -31,6 +31,7 @@ from protocol.calls import (
 from protocol.description import SlaveDescription, StateKind
 from protocol.errors import DeadlineError, DoublestepError
 from tests.faults.test_processes import Start, start
+from tests.support.slow import quick_at
 
 __all__ = ["start"]
 
@@ -56,7 +57,7 @@ def lag_file(folder: Path, capability_dir: Path, bus: str = "", simulation: str 
     ("accident", "words"),
     [("error", "an accident"), ("crash", "died by SIGSEGV"), ("hang", "raise step_timeout in")],
 )
-@pytest.mark.parametrize("recovery", ["auto", "off"])
+@pytest.mark.parametrize("recovery", quick_at(["auto"], ["auto", "off"]))
 def test_a_terminate_that_fails_does_not_fail_the_run(  # noqa: PLR0917
     accident: str,
     words: str,

@@ -68,7 +68,7 @@ WITHOUT_SHRINKING = (Phase.explicit, Phase.reuse, Phase.generate)
 """What is drawn is simple as it is."""
 
 
-@settings(max_examples=40, phases=WITHOUT_SHRINKING)
+@settings(max_examples=15, phases=WITHOUT_SHRINKING)
 @given(
     st.sampled_from(["rich", "mod"]),
     st.sampled_from(["auto", 0, 1, 2, 3]),
@@ -91,7 +91,7 @@ def test_a_jump_is_found_wherever_it_is(
     assert largest_error(result, jumps) < 1e-5 * abs(jump)
 
 
-@settings(max_examples=15, phases=WITHOUT_SHRINKING)
+@settings(max_examples=5, phases=WITHOUT_SHRINKING)
 @example([1.6804408697559372, 1.7175634198155068])
 @example([0.11253358143414634, 2.0333014966714726, 2.0, 0.4394135589371576])
 @given(

@@ -23,6 +23,7 @@ from tests.support.quarter_car_case import (
     global_errors,
     run_slaves,
 )
+from tests.support.slow import quick_at
 
 SLOPES = replace(ALL, max_output_derivative_order=1)
 CONSTANT = replace(ALL, can_interpolate_inputs=False)
@@ -62,7 +63,7 @@ def completed(system: System, slaves: dict[str, Any]) -> Result:
 
 
 @pytest.mark.parametrize(("chassis", "wheel"), list(product(KINDS, repeat=2)))
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", quick_at(["mod"], ESTIMATORS))
 @pytest.mark.parametrize("sequence", SEQUENCES)
 def test_any_mixture_comes_to_its_end_with_its_error_under_control(
     chassis: str, wheel: str, estimator: str, sequence: str

@@ -81,7 +81,7 @@ def test_signals_that_jump_one_after_the_other_are_all_met(
     assert result["signals.s_0"][-1] == 0.0
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(st.floats(0.3, 3.0), st.booleans())
 @example(1.75, True)  # at the smallest H the jump is in the comparison solution alone
 def test_where_signals_jump_does_not_matter(scale: float, derivatives: bool) -> None:

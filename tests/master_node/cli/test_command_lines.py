@@ -26,6 +26,7 @@ from slave_node.cli.serve import _default_name
 from tests.faults.test_processes import MainCommand, command
 from tests.support.interrupting import Interrupt
 from tests.support.quarter_car_case import EXAMPLES
+from tests.support.slow import quick_at
 
 __all__ = ["command"]
 
@@ -250,7 +251,9 @@ def test_a_check_of_one_model(capability_dir: Path, command: MainCommand) -> Non
 # ---- Tables on 80 columns -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fmu", ["all_types3", "many_variables", "plain_lag"])
+@pytest.mark.parametrize(
+    "fmu", quick_at(["all_types3"], ["all_types3", "many_variables", "plain_lag"])
+)
 def test_tables_of_models_keep_80_columns(fmu: str, capability_dir: Path) -> None:
     """Law: no line is longer, and the words of every description are there as a whole."""
     path = capability_dir / f"{fmu}.fmu"

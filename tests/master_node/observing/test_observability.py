@@ -44,6 +44,7 @@ from protocol.wire.replies import encode_error, encode_reply
 from slave_node.serving.metrics import CountingWorker
 from tests.faults.test_processes import EXAMPLES, FOREVER, Command, has_stepped, start, system_file
 from tests.support.places import SUPPORT
+from tests.support.slow import quick_at
 from tests.support.waiting import BOUND, wait_until
 
 __all__ = ["start"]  # the fixture
@@ -123,7 +124,7 @@ def test_master_and_slave_log_json(start: Start, tmp_path: Path, endpoint: str) 
     ]
     file = system_file(tmp_path, None, None, simulation=FOREVER + 'recovery = "off"\n')
     master = start(
-        *("master_node", "run", file, "--listen", endpoint, "--log-format", "json"),
+        *("master_node", "run", file, "--no-plot", "--listen", endpoint, "--log-format", "json"),
         *("--output", tmp_path / "out"),
     )
     slaves[1].wait_for("claimed by")
@@ -304,7 +305,7 @@ def test_metrics_of_a_run(start: Start, tmp_path: Path, endpoint: str) -> None:
     )
     file = system_file(tmp_path, wheel=None, simulation=FOREVER)
     master = start(
-        *("master_node", "run", file, "--listen", endpoint, "--metrics-port", "0"),
+        *("master_node", "run", file, "--no-plot", "--listen", endpoint, "--metrics-port", "0"),
         *("--output", tmp_path / "out"),
     )
     urls = []
@@ -398,7 +399,7 @@ def assert_within(inner: dict[str, Any], outer: dict[str, Any]) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="uses signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", quick_at([signal.SIGKILL], [signal.SIGINT, signal.SIGKILL]))
 def test_a_trace_is_whole_whatever_ends_the_run(
     number: signal.Signals, start: Start, tmp_path: Path
 ) -> None:

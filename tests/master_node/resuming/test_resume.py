@@ -40,6 +40,7 @@ from tests.faults.test_processes import (
 from tests.support.interrupting import Interrupt
 from tests.support.places import SUPPORT
 from tests.support.quarter_car_case import EXAMPLES
+from tests.support.slow import quick_at
 from tests.support.waiting import wait_until
 
 __all__ = ["command", "start"]
@@ -97,7 +98,7 @@ JUMP = "stop_time = 1.0\nevents = [0.5]\n"
         ("stop_time = 0.2\ncheckpoint_interval = 1e-6\nlargest_step_size = 1e-3\n", (60, 30)),
     ],
 )
-@pytest.mark.parametrize("every", [1, 3])
+@pytest.mark.parametrize("every", quick_at([1], [1, 3]))
 def test_an_interrupted_run_goes_on_to_the_same_bits(
     simulation: str, numbers: tuple[int, ...], every: int, tmp_path: Path
 ) -> None:
@@ -164,7 +165,9 @@ OUTER = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 @pytest.mark.parametrize("kind", ["a package", "a description that names a package"])
-@pytest.mark.parametrize("when", ["behind a checkpoint", "before the first one"])
+@pytest.mark.parametrize(
+    "when", quick_at(["behind a checkpoint"], ["behind a checkpoint", "before the first one"])
+)
 def test_what_was_unpacked_is_unpacked_again(
     kind: str, when: str, tmp_path: Path, quarter_car_ssp: Path
 ) -> None:
@@ -221,7 +224,7 @@ def _disk_full(path: Path, *_: object) -> None:
 
 
 @pytest.mark.parametrize("what", ["parquet_file write_parquet", "dymola_mat write_mat"])
-@pytest.mark.parametrize("interval", [60, 0])
+@pytest.mark.parametrize("interval", quick_at([60], [60, 0]))
 @pytest.mark.parametrize("accident", ["kill", "Ctrl-C", "full disk"])
 def test_results_that_were_not_completed(
     what: str, interval: int, accident: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -339,7 +342,7 @@ def test_ctrl_c_before_a_resumed_run_has_begun(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="uses signals and /proc")
-@pytest.mark.parametrize("accident", ["kill master", "interrupt master"])
+@pytest.mark.parametrize("accident", quick_at(["kill master"], ["kill master", "interrupt master"]))
 def test_a_master_that_is_killed(
     accident: str, start: Start, command: MainCommand, tmp_path: Path
 ) -> None:

@@ -17,6 +17,7 @@ from master_node.observing.observers import Attempt
 from master_node.simulation import resume
 from protocol.errors import DoublestepError, InterruptedRunError, ResultsError, SteeringError
 from tests.support.quarter_car_case import EXAMPLES
+from tests.support.slow import quick_at
 
 STOP = 0.5
 FILES = ("results.csv", "steps.csv")
@@ -223,7 +224,7 @@ def test_marks_belong_to_their_run_and_are_bounded(session: Session) -> None:
 # ---- Changes ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("version", quick_at([3], [2, 3]))
 @pytest.mark.parametrize("slave", [{}, {"state": "fork"}, {"state": "replay"}, {"state": "none"}])
 def test_what_is_set_holds_from_there_on(
     capability_dir: Path, version: int, slave: Mapping[str, Any]

@@ -72,6 +72,7 @@ from slave_node.certificates import Host, make_certificates
 from tests.faults.test_network import Commands
 from tests.faults.test_processes import FOREVER, Command, Gates, endpoints, has_stepped, toml
 from tests.support.quarter_car_case import DISPLACEMENT, EXAMPLES
+from tests.support.slow import quick_at
 from tests.support.waiting import BOUND, wait_until
 
 pytestmark = [
@@ -168,7 +169,13 @@ def slave_processes(agent: Command) -> dict[str, psutil.Process]:
 # ---- Runs ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("way", ["agents connect", "agents listen", "through an agent with TLS"])
+@pytest.mark.parametrize(
+    "way",
+    quick_at(
+        ["through an agent with TLS"],
+        ["agents connect", "agents listen", "through an agent with TLS"],
+    ),
+)
 def test_the_same_bits_with_slaves_of_two_agents(  # noqa: PLR0917  fixtures
     way: str,
     start: Commands,
@@ -1009,7 +1016,7 @@ def test_what_became_of_a_slave_is_told_by_its_agent(
     ), last
 
 
-@pytest.mark.parametrize("victim", ["slave", "agent"])
+@pytest.mark.parametrize("victim", quick_at(["agent"], ["slave", "agent"]))
 def test_a_slave_that_is_lost_is_started_again_elsewhere_if_need_be(  # noqa: PLR0917  fixtures
     victim: str,
     start: Commands,
@@ -1085,7 +1092,7 @@ def test_an_agent_that_stops_while_it_is_asked_to_start_a_slave(
         assert agent.wait() == 0, agent.text
 
 
-@pytest.mark.parametrize("victim", ["agent", "master"])
+@pytest.mark.parametrize("victim", quick_at(["agent"], ["agent", "master"]))
 def test_nothing_outlives_who_it_works_for(  # noqa: PLR0917  fixtures
     victim: str,
     start: Commands,

@@ -25,6 +25,7 @@ from protocol.bus.zenoh import ZenohBus
 from protocol.wire.keys import STATUS, SlaveKey
 from protocol.wire.records import decode_map
 from slave_node.cli.app import app
+from tests.support.slow import quick_at
 from tests.support.waiting import BOUND, is_quick
 
 pytestmark = [
@@ -213,7 +214,9 @@ def test_a_slave_says_when_it_is_ready(start: Start, fmu_dir: Path, bus: ZenohBu
     assert status["state"] == "free"
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number", quick_at([signal.SIGTERM], [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+)
 def test_a_signal_ends_it_orderly(
     start: Start, fmu_dir: Path, scratch: Path, number: signal.Signals
 ) -> None:
@@ -262,7 +265,7 @@ def test_without_the_request_standard_input_does_not_matter(start: Start, fmu_di
     assert node.process.poll() is None
 
 
-@pytest.mark.parametrize("how", ["SIGTERM", "SIGINT", "parent"])
+@pytest.mark.parametrize("how", quick_at(["SIGTERM", "parent"], ["SIGTERM", "SIGINT", "parent"]))
 def test_it_ends_in_the_middle_of_a_step(endless: Node, how: str) -> None:
     """An endless step delays the ending no more than an idle slave does."""
     worker = endless.worker

@@ -49,6 +49,7 @@ from slave_node.states.fork_habits import Event, Habits
 from slave_node.states.held_process import HeldProcess
 from slave_node.worker.process import ModelReference, WorkerProcess
 from tests.support.quarter_car_case import DISPLACEMENT
+from tests.support.slow import quick_at
 from tests.support.state_programs import MODELS, begin, fragile, loaded, wander, wheel
 from tests.support.trial_slaves import examine
 from tests.support.waiting import BOUND, wait_until
@@ -99,7 +100,7 @@ def _status(process: psutil.Process) -> str:
 # ---- The same bits ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", quick_at([0], range(3)))
 def test_a_random_walk_through_states_meets_the_same_bits_as_natively(
     fmu_dir: Path, seed: int
 ) -> None:
@@ -134,7 +135,7 @@ def results(system: System, output: Path, kind: str, **options: Any) -> bytes:
     return (output / "results.csv").read_bytes()
 
 
-@pytest.mark.parametrize("estimator", ["mod", "rich"])
+@pytest.mark.parametrize("estimator", quick_at(["mod"], ["mod", "rich"]))
 def test_a_run_gives_the_same_file_however_states_are_saved(
     fmu_dir: Path, tmp_path: Path, estimator: str
 ) -> None:
@@ -337,7 +338,7 @@ def no_step_is_dear(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_step_is_dear")
-@pytest.mark.parametrize("estimator", ["mod", "rich"])
+@pytest.mark.parametrize("estimator", quick_at(["mod"], ["mod", "rich"]))
 def test_a_double_step_copies_each_process_once(
     fmu_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, estimator: str
 ) -> None:
