@@ -154,7 +154,7 @@ def slaves_without_rollback(coupled: CoupledSystem) -> tuple[int, ...]:
 
 
 def output_control(coupled: CoupledSystem, system: System) -> OutputControl:
-    """Which outputs are controlled how; none without an estimator."""
+    """Outputs that are controlled, and how; none without an estimator."""
     if system.simulation.estimator == "none":
         return NOT_CONTROLLED
     without = slaves_without_rollback(coupled)

@@ -1,4 +1,4 @@
-"""Which type can be handed on as which other without losing anything."""
+"""Types that can be handed on as others without losing anything."""
 
 from __future__ import annotations
 

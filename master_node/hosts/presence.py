@@ -1,4 +1,4 @@
-"""Which slaves are on the bus: waiting for them at first, and for those that vanish in mid run."""
+"""Slaves on the bus: the wait for them at first, and for those that vanish in mid run."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class HeldTable:
 
     @property
     def changes(self) -> tuple[float, ...]:
-        """When it changes [s]."""
+        """Times of its changes [s]."""
         times = self.times.tolist()
         return tuple(
             times[row] for row in range(1, len(times)) if self.values[row] != self.values[row - 1]

@@ -1,4 +1,4 @@
-"""Which polynomials inputs can have, from the communication points that there are."""
+"""Polynomials that inputs can have, from the communication points that there are."""
 
 from __future__ import annotations
 

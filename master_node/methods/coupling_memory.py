@@ -1,4 +1,4 @@
-"""When a system is coupled implicitly: what is remembered of it, and how it is decided.
+"""Decision for implicit coupling, and the memory that it is made from.
 
 The loop gain is the factor by which an error of the inputs comes back to them after one sweep
 through all slaves. An explicit double step is such a sweep: its error is what its estimate says
@@ -108,11 +108,11 @@ class CouplingMemory(NamedTuple):
         return not self.is_implicit and (is_stiff or is_lasting)
 
     def iterating(self, secants: tuple[Secants, ...]) -> CouplingMemory:
-        """When iterated double steps begin, with what is known of each slave."""
+        """Memory at the beginning of iterated double steps, with what is known of each slave."""
         return self._replace(is_implicit=True, secants=secants, in_a_row=0, lasting=0)
 
     def extrapolating(self, patience: int) -> CouplingMemory:
-        """When explicit double steps take over."""
+        """Memory at the time at which explicit double steps take over."""
         return CouplingMemory(
             patience=min(patience, _MOST_PATIENCE), explicit_step_size=self.explicit_step_size
         )

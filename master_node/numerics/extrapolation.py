@@ -19,7 +19,7 @@ from protocol.signals import MAX_ORDER, FloatArray, InputSignal
 
 
 class InputPolynomial(NamedTuple):
-    """Which conditions an input polynomial meets.
+    """Conditions that an input polynomial meets.
 
     Attributes:
         order: degree k.

@@ -45,7 +45,7 @@ class Secants(NamedTuple):
 
 
 class Interface(NamedTuple):
-    """Which inputs and outputs belong to which slave.
+    """Inputs and outputs of each slave.
 
     Attributes:
         input_slices, output_slices: for each slave, of the n inputs and of the m outputs.

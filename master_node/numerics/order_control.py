@@ -1,4 +1,4 @@
-"""Which input polynomial to use next: the one that allows the largest H for the same work.
+"""Choice of the next input polynomial: the one that allows the largest H for the same work.
 
 To leading order the error of a double step with a polynomial of degree q is proportional to
 u^(q+1) / (q+1)! times I_q, the integral of its nodes (see ``error_estimators``), and to how much

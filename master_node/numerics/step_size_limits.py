@@ -1,4 +1,4 @@
-"""Which communication step sizes the slaves take at all: bounds, fixed ones, multiples."""
+"""Communication step sizes that the slaves take at all: bounds, fixed ones, multiples."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ DiscreteValue = float | int | bool | str | bytes
 
 
 class OutputControl(NamedTuple):
-    """Which outputs are controlled how, as ``slave.variable``; both may be said of one.
+    """Outputs that are controlled, and how, as ``slave.variable``; both may be said of one.
 
     Attributes:
         double_step: those whose error is estimated with a comparison solution, before the double

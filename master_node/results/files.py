@@ -86,7 +86,7 @@ class BatchFile(ABC):
 
     @abstractmethod
     def _written(self) -> None:
-        """That batch is in the file: forget it."""
+        """Forget the batch, which is in the file."""
 
     def flush(self) -> None:
         """Write the batch, or leave the file as it was; both can be repeated after an error."""

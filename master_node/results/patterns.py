@@ -24,7 +24,7 @@ def is_name(pattern: str) -> bool:
 
 
 def chosen(patterns: Sequence[str], names: Sequence[str]) -> NDArray[np.bool_]:
-    """Which names match a pattern, and none that begins with ``!``; shape (len(names),).
+    """Names that match a pattern, and none that begins with ``!``; shape (len(names),).
 
     Without a pattern to match, all names do.
     """

@@ -1,4 +1,4 @@
-"""Which variables and which points of a run become results."""
+"""Variables and points of a run that become results."""
 
 from __future__ import annotations
 

@@ -217,7 +217,7 @@ class IteratedStepper:
 
 
 def interface_of(coupled: CoupledSystem) -> Interface:
-    """Which connected inputs and outputs belong to which slave."""
+    """Connected inputs and outputs of each slave."""
     return Interface(
         [part.input_slice for part in coupled.parts],
         [part.output_slice for part in coupled.parts],

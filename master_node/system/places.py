@@ -37,7 +37,7 @@ class Places(Protocol):
 
     @property
     def no_stop_time(self) -> str:
-        """That the system has no stop time."""
+        """Sentence: the system has no stop time."""
         ...
 
 

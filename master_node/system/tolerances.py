@@ -1,4 +1,4 @@
-"""Which tolerances hold for a variable."""
+"""Tolerances of a variable."""
 
 from __future__ import annotations
 

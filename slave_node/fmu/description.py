@@ -250,7 +250,7 @@ def _direct_dependencies(root: Element) -> dict[str, tuple[str, ...]]:
 
 
 def _hidden(variables: Variables) -> tuple[str, ...]:
-    """That names stand for several variables."""
+    """Remark on names that stand for several variables."""
     names = variables.hidden
     if not names:
         return ()

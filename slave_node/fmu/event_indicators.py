@@ -1,4 +1,4 @@
-"""When an event indicator z changes its domain (FMI 2.0.4 section 3.1.1, FMI 3.0 section 3.1.1).
+"""Changes of the domain of an event indicator z (FMI 2.0.4 section 3.1.1, FMI 3.0 section 3.1.1).
 
 The domains are z > 0 and z <= 0, so an exact zero belongs to what is below it. A model may change
 sides strictly beyond zero only, and one that asks z < 0 does in both directions. So an event is

@@ -127,7 +127,10 @@ class MasterWatch(Generic[_K]):
                 log.warning("the master of run %s is gone", run, extra={"run": run})
 
     def _look_again(self, key: _K, followed: _Followed) -> None:
-        """When it is late, or sooner where its process is here; the lock is held."""
+        """Look for the master again when it is late, or sooner where its process is here.
+
+        The lock is held.
+        """
         master = followed.master
         left = followed.absent_since + master.orphan_time - self._clock.monotonic()
         wait = left if left > 0.0 else _PERIOD

@@ -64,5 +64,5 @@ class Habits:
         self._uses[situation] = use
 
     def use(self, situation: Situation) -> Event | None:
-        """That of the last state saved in this situation; of the first one it is ``GIVE_UP``."""
+        """Use of the last state saved in this situation; that of the first one is ``GIVE_UP``."""
         return self._uses.get(situation, Event.GIVE_UP)

@@ -162,7 +162,7 @@ def _period(place: Place, size: float, moves: list[bool]) -> float | None:
 
 
 def _tick(place: Place, size: float, index: int) -> float:
-    """When the outputs move in step ``index``, counted from the second one [s]; after bisection."""
+    """Time at which the outputs move in step ``index``, counted from the second one [s]."""
     place.restored()
     for _ in range(index):
         last = place.step(size)

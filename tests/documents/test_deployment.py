@@ -38,7 +38,7 @@ SERVICES = {name: s for name, s in ALL_SERVICES.items() if "profiles" not in s}
 
 
 CLUSTER = (*SERVICES, "agent")
-"""What runs in pods."""
+"""Workloads that run in pods."""
 
 
 def documents() -> list[dict[str, Any]]:
@@ -390,7 +390,7 @@ def test_the_manifests_belong_together() -> None:
 
 @pytest.mark.parametrize("name", CLUSTER)
 def test_a_pod_keeps_to_the_restricted_standard(name: str) -> None:
-    """That of the Pod Security Standards, and more: read-only, bounded, no token of the cluster."""
+    """Pods are restricted, as by the Pod Security Standards, bounded, and have no token."""
     pod = pods()[name]
     security = pod["securityContext"]
     assert security["runAsNonRoot"] is True

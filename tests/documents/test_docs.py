@@ -669,7 +669,7 @@ def test_every_row_of_the_fault_matrix_names_tests_that_exist() -> None:
 
 
 def check_tests(what: str, proofs: str) -> None:
-    """That a cell names tests, all of which exist."""
+    """Check of a cell: it names tests, all of which exist."""
     named = re.findall(r"`(tests/[\w/]+/test_\w+\.py)::(\w+)`", proofs)
     assert named, f"no test for: {what}"
     assert proofs.count("`") == 2 * len(named), f"not a test: {proofs}"

@@ -31,7 +31,7 @@ from tests.faults.test_processes import system_file, worker_of
 from tests.support.waiting import BOUND
 
 NUMBER = 50
-"""How many points there are."""
+"""Number of points."""
 
 _EARLIEST, _LATEST = 60, 190  # after the first checkpoint, and of 200 attempts at least
 _SIMULATION = "stop_time = 0.4\nlargest_step_size = 1e-3\ncheckpoint_interval = 0.01\n"
@@ -160,7 +160,7 @@ class _Trigger:
         """See `Observer`."""
 
     def check(self) -> None:
-        """That it has happened."""
+        """Note that the fault has happened."""
         assert self.thread is not None, f"the run has only {self.attempts} attempts"
         self.thread.join(BOUND)
         if self.errors:

@@ -36,7 +36,7 @@ SYSTEM = System(
     **system_of_light_slaves(stop_time=0.4, initial_step_size=0.02, largest_step_size=0.02, order=1)
 )
 SHORT = SYSTEM.with_simulation(stop_time=0.08)
-"""What comes after it, to see that the slaves are as good as new."""
+"""A run behind the disturbed one, which shows that the slaves are as good as new."""
 STEP_TIMEOUT = 3.0
 ORPHAN_TIME = 5.0
 DISCOVERY_TIME = 5.0

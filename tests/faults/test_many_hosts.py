@@ -29,7 +29,7 @@ SIMULATION = "stop_time = 2.5\nlargest_step_size = 1e-3\n"
 """So many steps that a run takes much longer than what happens to it at its beginning."""
 
 CUT = 2.0
-"""How long the cable is pulled [s]."""
+"""Time for which the cable is pulled [s]."""
 
 
 def steps_on_disk(directory: Path) -> int:

@@ -30,7 +30,7 @@ pytestmark = [
 
 
 NAP = 0.5
-"""How long a step takes during which a cable is pulled [s]."""
+"""Duration of a step during which a cable is pulled [s]."""
 
 SIMULATION = "stop_time = 0.1\nlargest_step_size = 1e-3\n"
 

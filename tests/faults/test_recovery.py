@@ -619,7 +619,7 @@ def test_another_model_is_not_taken(fresh: Iterator[SlaveLink], tmp_path: Path) 
 
 
 def test_the_loss_of_another_slave_is_not_its_own(fresh: Iterator[SlaveLink]) -> None:
-    """When a run ends because of another slave, this one is not started again."""
+    """A slave is not started again when the run ends because of another slave."""
 
     class Abandoned(Mortal):
         def finish(self) -> Reply:

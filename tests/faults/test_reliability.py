@@ -254,7 +254,7 @@ class Stubborn(Model):
 
 @pytest.mark.parametrize("number", quick_at([signal.SIGINT], [signal.SIGINT, signal.SIGTERM]))
 def test_a_second_ctrl_c_kills(number: signal.Signals, start: Start, tmp_path: Path) -> None:
-    """When the first one cannot end the run, as a model in process swallows it, the second does."""
+    """The second Ctrl-C ends a run that the first cannot, as a model in process swallows it."""
     (tmp_path / "stubborn.py").write_text(STUBBORN)
     file = tmp_path / "stubborn.toml"
     file.write_text(

@@ -65,7 +65,7 @@ def largest_error(result: Result, jumps: Jumps) -> float:
 
 
 WITHOUT_SHRINKING = (Phase.explicit, Phase.reuse, Phase.generate)
-"""What is drawn is simple as it is."""
+"""Drawn examples are simple as they are."""
 
 
 @settings(max_examples=15, phases=WITHOUT_SHRINKING)

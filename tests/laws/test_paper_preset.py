@@ -21,7 +21,7 @@ PAPER: dict[str, Any] = {
     "initial_history": "rest",
     "coupling": "explicit",
 }
-"""What it stands for, key by key."""
+"""Settings of the preset, key by key."""
 
 OTHERS: dict[str, Any] = {
     "order": 3,

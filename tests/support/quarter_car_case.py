@@ -159,7 +159,7 @@ ALL = Capabilities(
     can_interpolate_inputs=True,
     can_handle_variable_step_size=True,
 )
-"""What error control needs, and nothing more: outputs without derivatives."""
+"""Capabilities that error control needs, and nothing more: outputs without derivatives."""
 
 
 class LinearSlave(Slave):

@@ -230,7 +230,7 @@ def _left_files(scratch: Path) -> list[Path]:
 
 
 def _errors(cast: Cast) -> str:
-    """That masters ended with."""
+    """Errors that masters ended with."""
     lines = cast.told().get("master", "").splitlines()
     return " | ".join(line for line in lines if line.startswith("master-node: "))
 

@@ -14,6 +14,7 @@ from protocol.errors import ConfigurationError, SlaveError
 from slave_node.fmu.description import describe_fmu
 from tests.conftest import EXAMPLES
 from tests.support.places import SUPPORT
+from tests.support.slow import quick_at
 
 
 def clock_and_device(folder: Path, **simulation: Any) -> System:
@@ -81,7 +82,7 @@ def test_a_thermostat_switches_when_theory_says_so(capability_dir: Path) -> None
     assert result["relay.changes"][-1] == len(expected)
 
 
-@pytest.mark.parametrize("state", ["fork", "replay"])
+@pytest.mark.parametrize("state", quick_at(["fork"], ["fork", "replay"]))
 def test_events_are_the_same_however_states_are_saved(capability_dir: Path, state: str) -> None:
     """A slave that was taken back from an event forgets that it told of it: bit for bit."""
     native = simulate(thermostat(capability_dir, stop_time=0.22), in_process=True)

@@ -11,6 +11,7 @@ import pytest
 from master_node import Result, System, load_system, simulate
 from master_node.system.files import export_system, open_system
 from protocol.errors import ConfigurationError
+from tests.support.slow import quick_at
 
 LAG = (
     "from protocol.variables import Variable, VariableType\n"
@@ -64,7 +65,7 @@ INTEGRALS = {
         if (version, source) != (1, "total")
     ],
 )
-@pytest.mark.parametrize("estimator", ["mod", "rich"])
+@pytest.mark.parametrize("estimator", quick_at(["mod"], ["mod", "rich"]))
 def test_what_a_model_computes_feeds_inputs(
     tmp_path: Path, capability_dir: Path, version: int, source: str, estimator: str
 ) -> None:

@@ -24,6 +24,7 @@ from protocol.errors import ConfigurationError, DoublestepError, SlaveError, Ste
 from protocol.signals import InputSignal
 from tests.support.places import ROOT, SUPPORT
 from tests.support.quarter_car_case import ALL, LinearSystem, Run, run_slaves
+from tests.support.slow import quick_at
 
 EXAMPLE = ROOT / "examples" / "external_inputs"
 STOP = 3.0
@@ -299,7 +300,7 @@ def test_a_slave_without_interpolation_gets_means(estimator: str) -> None:
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.3)
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", quick_at(["mod"], ESTIMATORS))
 @pytest.mark.parametrize("capabilities", [SLOPES, HELD])
 def test_what_polynomials_leave_of_a_function_is_controlled(
     estimator: str, capabilities: Any
@@ -499,7 +500,7 @@ def test_outputs_that_contain_a_held_input(evaluates: bool) -> None:
 
 
 @pytest.mark.parametrize("sequence", ["jacobi", "gauss-seidel"])
-@pytest.mark.parametrize("estimator", [*ESTIMATORS, "none"])
+@pytest.mark.parametrize("estimator", quick_at(["mod", "none"], [*ESTIMATORS, "none"]))
 def test_connected_and_external_inputs_of_one_slave(
     oscillator_dir: Path, sequence: str, estimator: str
 ) -> None:

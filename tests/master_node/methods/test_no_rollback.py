@@ -49,6 +49,7 @@ from tests.support.quarter_car_case import (
     global_errors,
     run_slaves,
 )
+from tests.support.slow import quick_at
 
 SEQUENCES = ("jacobi", "gauss-seidel")
 NO_STATE = Capabilities(can_interpolate_inputs=True, can_handle_variable_step_size=True)
@@ -225,7 +226,7 @@ def test_a_rejection_leaves_slaves_without_rollback_where_they_are() -> None:
 
 
 @pytest.mark.parametrize("without", MIXTURES, ids="".join)
-@pytest.mark.parametrize("order", ["auto", 2])
+@pytest.mark.parametrize("order", quick_at(["auto"], ["auto", 2]))
 def test_the_tolerance_controls_the_error(without: Collection[str], order: Any) -> None:
     """Law: over three decades a tolerance ten times smaller makes the error several times smaller.
 
@@ -245,7 +246,7 @@ def test_the_tolerance_controls_the_error(without: Collection[str], order: Any) 
 
 
 @pytest.mark.parametrize("without", [("chassis",), ("wheel",), ("chassis", "wheel")])
-@pytest.mark.parametrize("slopes", [0, SLOPES])
+@pytest.mark.parametrize("slopes", quick_at([0], [0, SLOPES]))
 def test_the_quarter_car_is_within_its_tolerance(without: Collection[str], slopes: int) -> None:
     """The paper's benchmark: an error below that with rollback in both, for more steps."""
     options = {"order": "auto", "initial_step_size": None}
@@ -263,7 +264,7 @@ def test_the_quarter_car_is_within_its_tolerance(without: Collection[str], slope
 # ---- Order --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("k", range(4))
+@pytest.mark.parametrize("k", quick_at([1, 3], range(4)))
 @pytest.mark.parametrize("without", [("chassis",), ("wheel",), ("chassis", "wheel")])
 def test_the_global_order_is_k_plus_1(without: Collection[str], k: int) -> None:
     """Law: with a fixed H, an exact start and polynomials of degree k the error falls as H^(k+1).

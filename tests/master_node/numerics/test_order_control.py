@@ -25,6 +25,7 @@ from master_node.numerics.order_control import (
 )
 from tests.support.places import ROOT
 from tests.support.quarter_car_case import car, global_errors, run_slaves
+from tests.support.slow import quick_at
 
 P1, P2, P3 = InputPolynomial(1, 1), InputPolynomial(2, 1), InputPolynomial(3, 1)
 ALPHA = 0.85
@@ -151,7 +152,7 @@ def do_steps(path: Path, **simulation: object) -> int:
     return int(max(result.summary["do_steps"].values()))
 
 
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
+@pytest.mark.parametrize("tolerance", quick_at([1e-4], [1e-4, 1e-6]))
 @pytest.mark.parametrize("name", ["two_mass", "van_der_pol", "chain"])
 def test_auto_is_as_good_as_the_best_fixed_polynomial(
     oscillator_dir: Path, name: str, tolerance: float

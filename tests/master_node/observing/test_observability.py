@@ -437,7 +437,7 @@ def test_a_trace_survives_strange_names_and_numbers(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_trace_on_a_full_disk_is_an_error() -> None:
-    """That names the file."""
+    """The error names the file."""
     with pytest.raises(ResultsError, match="/dev/full"):
         TraceWriter(Path("/dev/full"))
 

@@ -1,4 +1,4 @@
-"""Which way of saving states is taken, who chooses it, and what is said of it."""
+"""Way of saving states: who chooses it, and what is said of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which results are kept, and in which files: all formats hold the same, whatever ends the run."""
+"""Results that are kept, and their files: all formats hold the same, whatever ends the run."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
     assert not (tmp_path / "parts" / "checkpoint").exists()
 
 
-@pytest.mark.parametrize("which", ["wheel", "both"])
+@pytest.mark.parametrize("which", quick_at(["wheel"], ["wheel", "both"]))
 def test_slaves_without_rollback(which: str, tmp_path: Path, capability_dir: Path) -> None:
     """Slaves that cannot be saved are replayed from T_0, in mixed runs and all together."""
     names = {"wheel": ("wheel",), "both": ("chassis", "wheel")}[which]

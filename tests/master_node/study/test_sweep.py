@@ -469,7 +469,7 @@ def rows(output: Path) -> list[dict[str, str]]:
 
 
 def identities(output: Path) -> dict[str, int]:
-    """Which file ``run.json`` of each run is: another one after the run was executed again."""
+    """Identities of the files ``run.json``: a run that was executed again has another one."""
     return {path.name: (path / "run.json").stat().st_ino for path in (output / "runs").iterdir()}
 
 
@@ -523,7 +523,8 @@ def test_what_was_run_is_not_run_again(tmp_path: Path) -> None:
     And a directory with runs of another study is not touched.
     """
     car(tmp_path, f"{MODELS}:BreaksDown")
-    text = '[parameters]\n"chassis.breaks_at" = [1.0, 2.0, 0.01]\n"wheel.z" = 0.1\n' + OUTPUTS
+    text = '[parameters]\n"chassis.breaks_at" = [1.0, 2.0, 0.01]\n"wheel.z" = 0.1\n'
+    text += "[run]\nin_process = true\n" + OUTPUTS
     file, out = study_file(tmp_path, text), tmp_path / "out"
     done = sweep(file, out)
     assert done.code == 1, done.text

@@ -318,7 +318,7 @@ def test_who_came_first_does_not_matter(endpoint: str) -> None:
 
 
 def test_a_slave_can_be_the_one_that_listens(endpoint: str) -> None:
-    """Which side listens does not matter, either."""
+    """The side that listens does not matter, either."""
     server = ZenohBus(Endpoints(listen=(endpoint,)))
     client = ZenohBus(Endpoints(connect=(endpoint,)))
     try:

@@ -32,7 +32,7 @@ from slave_node.loading import describe_model
 from tests.support.ssp_documents import ssd, system
 
 ZEROS = 200 * 2**20
-"""What a bomb of these tests unpacks to [bytes]."""
+"""Size of an unpacked bomb of these tests [bytes]."""
 
 ROOM = 48 * 2**20
 """No refusal takes as much memory [bytes]."""

@@ -896,7 +896,7 @@ class Listed:
 
 
 def test_which_agent_is_taken() -> None:
-    """That with the most free licences, then the first by name; one that has the model."""
+    """The agent with the most free licences, then the first by name; one that has the model."""
     wheel = AgentModel("wheel.fmu", "a" * 64, 1)
     held = ("a", "b", "c")
 

@@ -261,7 +261,7 @@ SCALARS: dict[str, tuple[StartValue, StartValue]] = {
     "enumeration": (3, 1),
     "float32": (0.1, 2.0 * float(np.float32(0.1))),
 }
-"""What goes in, at the limits, and what comes out by the FMU's rules."""
+"""Inputs at the limits, and outputs by the FMU's rules."""
 
 
 def test_values_of_all_types_make_the_round_trip(load: Load) -> None:
@@ -367,7 +367,7 @@ FMI_2: dict[str, tuple[StartValue, StartValue]] = {
     "enumeration": (3, 1),
     "real_discrete": (0.1, 0.2),
 }
-"""What goes in, and what comes out by the FMU's rules."""
+"""Inputs, and outputs by the FMU's rules."""
 
 
 def test_all_types_of_fmi_2(load: Load) -> None:
