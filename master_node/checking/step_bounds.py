@@ -30,6 +30,7 @@ def step_bounds(ready: Ready, loops: Sequence[LoopReport]) -> list[StepBound]:
     return [
         StepBound("smallest H", limits.smallest, _smallest(ready, limits.smallest)),
         StepBound("largest H", limits.largest, f"{_largest(ready, limits.largest)}; {together}"),
+        *_at_rest(ready, limits.largest),
         *_rules(ready),
         *_events(ready),
         *_error_control(ready),
@@ -60,6 +61,19 @@ def _largest(ready: Ready, value: float) -> str:
         if slave.largest_step_size is not None and float(slave.largest_step_size) >= value:
             return f"largest_step_size of {name}"
     return "rules of slaves"
+
+
+def _at_rest(ready: Ready, largest: float) -> Iterator[StepBound]:
+    """Bound of H where no estimate has one."""
+    coupled, value = ready.coupled, ready.prepared.system.simulation.largest_at_rest
+    is_coupled = coupled.source.size or coupled.discrete.holds_inputs
+    if (
+        is_coupled
+        and value < largest
+        and len(slaves_without_rollback(coupled)) < len(coupled.parts)
+    ):
+        why = "a 32nd of the simulated time, where no estimate bounds H; largest_step_size sets it"
+        yield StepBound("H at rest", value, why)
 
 
 def _rules(ready: Ready) -> Iterator[StepBound]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from master_node.coupling.outputs import Outputs
 from master_node.judging.available_polynomials import AvailablePolynomials
 from master_node.judging.comparison import StepError
-from master_node.methods.base import Back, Counts, Ended, Setup, Shape, Verdict, ended_by
+from master_node.methods.base import Back, Counts, Ended, Setup, Shape, Verdict, ended_by, summed
 from master_node.methods.first_step_size import FirstStepSize
 from master_node.methods.judges import StepJudge
 from master_node.methods.next_step_size import StepSizeChoice, controller
@@ -37,6 +37,9 @@ log = logging.getLogger("master_node")
 _INF = float("inf")
 _NEAR = 0.1
 """Part of the next H that the last one is at least, for the points before to be of use."""
+
+_WHOLE = 0.99
+"""Part of the largest H at rest, from which on it is this one that bounds a step."""
 
 
 class Way(NamedTuple):
@@ -105,6 +108,9 @@ class ComparedSteps:
         self._targets = Targets(setup, limits)
         self._controller = controller(self._settings, limits)
         self._discontinuities = Discontinuities(setup, limits)
+        is_coupled = setup.coupled.source.size or setup.coupled.discrete.holds_inputs
+        at_rest = setup.system.simulation.largest_at_rest if is_coupled else _INF
+        self._at_rest = max(at_rest, limits.smallest)
         self._loses_events: set[str] = set()
 
     # --- where attempts lead --------------------------------------------------------------------
@@ -117,7 +123,7 @@ class ComparedSteps:
         search, order = self._discontinuities.nothing(), self.parts.restarted
         position = Position(history, outputs, settings.step_size, order, search)
         if settings.initial_step_size is None:
-            position = self.parts.first.chosen(position, self._limits.largest)
+            position = self.parts.first.chosen(position, min(self._limits.largest, self._at_rest))
         step_size = self._limits.bounded(position.step_size)
         if settings.rests_before_start:
             history = CouplingHistory.at_rest(self._start, u, depth, step_size)
@@ -319,6 +325,8 @@ class ComparedSteps:
             counts = {"double_steps_at_discontinuities": 1}
             if position.search.passed(step.times.end).end is None:
                 counts["double_steps_at_false_alarms"] = position.search.attempts + 1
+        if step.times.step_size >= _WHOLE * self._at_rest:
+            counts = summed(counts, {"double_steps_at_rest": 1})
         return Verdict(
             error.norm,
             error.limiting_variable,
@@ -408,6 +416,7 @@ class ComparedSteps:
         next_size, order, memory = self.parts.choice.after_acceptance(
             position, step, error, defects, history
         )
+        next_size = min(next_size, self._at_rest)
         search = position.search.passed(times.end)
         if position.search.end is not None and search.end is None:  # a false alarm
             next_size, memory = max(next_size, position.step_size), NOTHING

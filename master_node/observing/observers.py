@@ -198,6 +198,8 @@ class Statistics:
         iterated_double_steps: accepted ones whose inputs were iterated.
         stiff_double_steps: accepted explicit ones with a loop gain above 0.9, of which the estimate
             is uncertain.
+        double_steps_at_rest: accepted ones of the largest H that is chosen where no estimate
+            bounds it.
         time: the last accepted communication point [s].
         smallest_step_size, largest_step_size: over accepted steps [s]; NaN before the first.
     """
@@ -212,6 +214,7 @@ class Statistics:
     steps_above_tolerance: int = 0
     iterated_double_steps: int = 0
     stiff_double_steps: int = 0
+    double_steps_at_rest: int = 0
     round_trips: int = 0
     wait_time: float = 0.0
     wall_time: float = 0.0

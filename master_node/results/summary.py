@@ -49,6 +49,7 @@ def summarize(start: RunStart, end: RunEnd, settings: Mapping[str, object]) -> d
             "steps_above_tolerance": statistics.steps_above_tolerance,
             "iterated_double_steps": statistics.iterated_double_steps,
             "stiff_double_steps": statistics.stiff_double_steps,
+            "double_steps_at_rest": statistics.double_steps_at_rest,
             "warnings": warnings_of(statistics),
             "controlled_by": start.control._asdict(),
             "state_kind": start.state_kinds,

@@ -46,6 +46,7 @@ _COUNTERS = (
     "steps_above_tolerance",
     "iterated_double_steps",
     "stiff_double_steps",
+    "double_steps_at_rest",
     "time",
     "smallest_step_size",
     "largest_step_size",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from fractions import Fraction
+from math import inf
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -34,6 +35,9 @@ _LONGEST_TIME = 1e30
 
 _MAX_POINTS = 1e8
 """Largest number of results that may be asked for by their interval."""
+
+_STEPS_AT_REST = 32
+"""Number of steps that the simulated time is split into at least, where nothing asks for more."""
 
 PAPER: Mapping[str, Any] = {
     "order": 1,
@@ -77,7 +81,7 @@ class SimulationSettings(FrozenTable):
         slave_tolerance: relative tolerance for the slaves' own solvers; default 0.01 RTOL.
         alpha, theta_min, theta_max: of the step size controller (the paper, section 3).
         smallest_step_size, largest_step_size: bounds of H [s]; defaults: 1e-9 of the simulated
-            time, and half of it.
+            time, and half of it; but see `largest_at_rest`.
         initial_history: ``rest``: the system rested before the start, so order k is used from
             the first step; ``none``: the order grows as communication points come in. Default:
             ``none`` where the order is chosen, else ``rest``.
@@ -230,6 +234,18 @@ class SimulationSettings(FrozenTable):
         start, end = float(self.start_time), self.end
         in_decimals = (Fraction(repr(end)) - Fraction(repr(start))) / 2
         return max((end - start) / 2, float(in_decimals))
+
+    @property
+    def largest_at_rest(self) -> float:
+        """Largest H that is chosen where no estimate bounds it [s]; infinite: none.
+
+        A source that moves for longer than this is met by a communication point, however quiet all
+        was before. A given ``largest_step_size`` or ``initial_step_size`` above it wins.
+        """
+        if self.largest_step_size is not None or self.constants == "paper":
+            return inf
+        part = (self.end - float(self.start_time)) / _STEPS_AT_REST
+        return max(part, self.initial_step_size or 0.0)
 
     @property
     def polynomial(self) -> InputPolynomial:

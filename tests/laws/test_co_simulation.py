@@ -689,7 +689,8 @@ def test_an_algebraic_loop_is_solved() -> None:
 def test_an_algebraic_loop_is_solved_where_the_plain_iteration_diverges(gain: float) -> None:
     """y_a = g y_b + 1 and y_b = 1.5 g y_a: the loop's gain 1.5 g^2 is above 1.
 
-    At T_0, and with ``evaluate_outputs`` at every communication point.
+    At T_0, and with ``evaluate_outputs`` at every communication point; iterated double steps have
+    converged at a hundredth of the tolerance, 1e-6 (1 + |y|).
     """
     system = gains(
         ("a.y", "b.u"), ("b.y", "a.u"), a={"gain": gain, "offset": 1.0}, b={"gain": gain * 1.5}
@@ -699,7 +700,7 @@ def test_an_algebraic_loop_is_solved_where_the_plain_iteration_diverges(gain: fl
         options = {"evaluate_outputs": True, "estimator": estimator}
         result = completed(run_slaves(system.with_simulation(**options)))
         for row in result.outputs[[0, len(result.time) // 2, -1]]:
-            assert row == pytest.approx([y_a, 1.5 * gain * y_a], rel=1e-6, abs=1e-9)
+            assert row == pytest.approx([y_a, 1.5 * gain * y_a], rel=2e-6, abs=2e-6)
 
 
 @pytest.mark.parametrize("gain", [1.0, 1e200])
