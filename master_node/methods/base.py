@@ -157,10 +157,12 @@ class Ended(NamedTuple):
     """End of a run.
 
     Attributes:
-        note: a slave's wish to end earlier, in words; "": the stop time is reached.
+        note: why it ended earlier, in words; "": the stop time is reached.
+        is_stopped: whether an action ended it, and no slave.
     """
 
     note: str = ""
+    is_stopped: bool = False
 
 
 def ended_by(slave: str, time: float) -> Ended:

@@ -83,6 +83,7 @@ class Position(NamedTuple):
         overrides: connected inputs that are cut from their sources.
         given: values that variables were set to during the run.
         restless: discrete outputs that change in every step.
+        actions: number of actions of the system that are done.
     """
 
     history: CouplingHistory
@@ -103,6 +104,7 @@ class Position(NamedTuple):
     overrides: Overrides = NO_OVERRIDES
     given: tuple[GivenValue, ...] = ()
     restless: RestlessOutputs = RestlessOutputs()
+    actions: int = 0
 
     @property
     def time(self) -> float:
@@ -110,5 +112,5 @@ class Position(NamedTuple):
         return self.history.times[0]
 
     def changed_as(self, other: Position) -> Position:
-        """This position, with all that users had changed at the other one."""
-        return self._replace(overrides=other.overrides, given=other.given)
+        """This position, with all that users and actions had changed at the other one."""
+        return self._replace(overrides=other.overrides, given=other.given, actions=other.actions)

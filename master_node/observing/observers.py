@@ -132,11 +132,12 @@ class Outcome(StrEnum):
     INTERRUPTED = "interrupted"
     FAILED = "failed"
     STOPPED = "stopped"
+    STOPPED_BY_ACTION = "stopped by an action"
 
     @property
     def is_complete(self) -> bool:
         """True if the run got to its end; others may be resumed."""
-        return self in (Outcome.COMPLETED, Outcome.TERMINATED)
+        return self in (Outcome.COMPLETED, Outcome.TERMINATED, Outcome.STOPPED_BY_ACTION)
 
 
 @dataclass(slots=True)

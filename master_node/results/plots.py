@@ -81,7 +81,7 @@ def _is_set_by_working_directory() -> bool:
 def _draw(result: Result, show: bool, variables: Sequence[str] | None) -> Figure:
     panels = _panels(result, _drawable(result) if variables is None else variables)
     shown = panels[:_OUTPUT_PANELS] if variables is None else panels
-    steps = result.steps
+    steps = result.steps[result.steps["step_size"] > 0.0]  # without changes by users and actions
     has_norms = bool(len(steps)) and not bool(np.isnan(steps["error_norm"]).all())
     count = len(shown) + bool(len(steps)) + has_norms
     figure = _new_figure((WIDTH, max(count, 1) * PANEL_HEIGHT + _TITLE_HEIGHT), show)

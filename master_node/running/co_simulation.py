@@ -33,10 +33,12 @@ from master_node.observing.observers import (
 from master_node.observing.run_warnings import warnings_of
 from master_node.preparing.initialization import initialize
 from master_node.resuming.checkpoints import NO_CHECKPOINTS, Checkpoints, Resumed
+from master_node.running.actions import Actions
 from master_node.running.interrupts import Interrupts
 from master_node.running.journal import Journal
 from master_node.running.loop import Loop
 from master_node.running.run import Run, ignored_overflow
+from master_node.running.steering import Steering
 from master_node.slaves.group import SlaveGroup
 from master_node.system.system import System
 from protocol.calls import Terminate
@@ -122,6 +124,7 @@ class CoSimulation:
             DoublestepError: after the observer was told; `InterruptedRunError` for Ctrl-C.
         """
         settings = self.system.simulation
+        actions = Actions(self.system, Steering(self.coupled, self.system))
         scheme = CouplingScheme.of(self.coupled, self.system)
         outputs = self.outputs
         if outputs is None:
@@ -149,7 +152,8 @@ class CoSimulation:
         try:
             self.checkpoints.begin(statistics, update)
             try:
-                run = self._run(scheme, outputs, statistics)
+                run = self._run(scheme, outputs, statistics, actions)
+                run.begin()
                 yield run
             finally:
                 update()
@@ -214,7 +218,13 @@ class CoSimulation:
             self.group.statistics,
         )
 
-    def _run(self, scheme: CouplingScheme, outputs: Outputs, statistics: Statistics) -> Run:
+    def _run(
+        self,
+        scheme: CouplingScheme,
+        outputs: Outputs,
+        statistics: Statistics,
+        actions: Actions,
+    ) -> Run:
         setup = Setup(self.group, self.coupled, scheme, self.system)
         method, interrupts = method_of(setup), Interrupts()
         grid, start = self.system.simulation.output_grid, setup.start
@@ -227,7 +237,7 @@ class CoSimulation:
                 self.coupled.overrides.set(position.overrides)
         journal = Journal(results, self.observer, statistics, interrupts)
         loop = Loop(method, position, journal, self.checkpoints, setup.missing)
-        return Run(setup, method, loop, journal, self.checkpoints)
+        return Run(setup, method, loop, journal, self.checkpoints, actions=actions)
 
     def _terminate(self, time: float) -> str:
         """Terminate all slaves at the end [s]; the results are complete, whatever they say to it.

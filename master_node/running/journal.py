@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from math import nan
 
-from master_node.coupling.result_points import ResultPoints, count_accepted
+from master_node.coupling.result_points import ReachedPoint, ResultPoints, count_accepted
 from master_node.methods.base import Back, Candidate, Counts, Shape, Verdict
+from master_node.methods.position import Position
 from master_node.numerics.extrapolation import highest
 from master_node.observing.observers import Attempt, Observer, Statistics
 from master_node.running.interrupts import Interrupts
@@ -64,6 +66,15 @@ class Journal:
         with self.interrupts:
             count_accepted(self.statistics, step.step_size, reached)
             self._count(verdict.counts)
+            self._observer.attempted(attempt)
+
+    def changed(self, position: Position, text: str) -> None:
+        """Tell of a change at a position, by a user or an action: a row without a step."""
+        self.results.cut(ReachedPoint(position.time, *position.outputs))
+        log.info("t=%r s: %s", position.time, text)
+        attempt = Attempt(position.time, 0.0, 0, 0, nan, True, text)
+        with self.interrupts:
+            self.statistics.discontinuities += 1
             self._observer.attempted(attempt)
 
     def rejected(self, time: float, back: Back) -> None:

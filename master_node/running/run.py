@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf
@@ -11,18 +11,19 @@ import numpy as np
 
 from master_node.coupling.outputs import gather, reading_calls
 from master_node.coupling.overrides import Overrides
-from master_node.coupling.result_points import ReachedPoint, ResultMemory
+from master_node.coupling.result_points import ResultMemory
 from master_node.methods.base import AnyMethod, Ended, Setup
 from master_node.methods.position import GivenValue, Position
 from master_node.observing.observers import Outcome, Statistics
 from master_node.resuming.checkpoints import Checkpoints, ResultPosition, counted, put_back
+from master_node.running.actions import Actions
 from master_node.running.journal import Journal
 from master_node.running.loop import Loop
+from master_node.running.steering import Values
 from master_node.slaves.group import Program
 from protocol.calls import Call, FreeState, GetState, Reply, SetState, SetValues
 from protocol.description import StateKind
 from protocol.errors import SteeringError
-from protocol.variables import StartValue
 
 _FIRST_MARK = 16
 """Number of the first mark's saved states; those below are of steps and checkpoints."""
@@ -30,8 +31,7 @@ _FIRST_MARK = 16
 MOST_MARKS = 100
 """Number of marks that are kept at a time: slaves hold a state for each."""
 
-Values = Mapping[str, Mapping[str, StartValue]]
-"""Values of variables, by slave and variable."""
+NOTHING: Values = {}
 
 
 @contextmanager
@@ -79,8 +79,10 @@ class Run:
         loop: takes them.
         journal: is told of them.
         checkpoints: are told where the run stands.
+        actions: are done by the run itself.
 
     Attributes:
+        steering: checks changes.
         statistics: counters.
         ended: how the run has ended; None: it has not.
     """
@@ -92,7 +94,11 @@ class Run:
         loop: Loop,
         journal: Journal,
         checkpoints: Checkpoints,
+        *,
+        actions: Actions,
     ) -> None:
+        self.steering = actions.steering
+        self._actions = actions
         self._setup = setup
         self._method = method
         self._loop = loop
@@ -119,6 +125,8 @@ class Run:
         if self.ended is None:
             return Outcome.STOPPED, f"stopped at t={self.position.time!r} s"
         note = self.ended.note
+        if self.ended.is_stopped:
+            return Outcome.STOPPED_BY_ACTION, note
         return (Outcome.TERMINATED if note else Outcome.COMPLETED), note
 
     # --- forward --------------------------------------------------------------------------------
@@ -127,7 +135,7 @@ class Run:
         """Step to the end; raises as `Loop.advance`."""
         with self._journal.interrupts.deferrable(), ignored_overflow():
             while self.ended is None:
-                self.ended = self._loop.advance()
+                self._advance(inf)
 
     def step(self, until: float = inf) -> None:
         """One accepted step; Ctrl-C waits for it, a second one breaks it off.
@@ -137,7 +145,34 @@ class Run:
             DoublestepError: as `Loop.advance`; the run cannot go on.
         """
         with self._whole("a step"):
-            self.ended = self._loop.advance(until)
+            self._advance(until)
+
+    def begin(self) -> None:
+        """Do what actions do where the run begins.
+
+        Raises:
+            ConfigurationError: no step can end at the time of an action.
+            DoublestepError: a slave refused.
+        """
+        self._actions.check_targets(self.position.actions, self.check_target)
+        with self._whole("an action"):
+            self._act()
+
+    def _advance(self, until: float) -> None:
+        """One accepted step, and the actions that are due behind it."""
+        due = self._actions.time(self.position.actions)
+        self.ended = self._loop.advance(min(until, due))
+        self._act()
+
+    def _act(self) -> None:
+        while self.ended is None and self.has_reached(self._actions.time(self.position.actions)):
+            done = self.position.actions
+            change = self._actions.change(done, self.position.overrides)
+            with self._journal.interrupts:
+                self._change(change.text, change.values, change.overrides, done + 1)
+            if change.stops:
+                note = f"stopped by an action at t={self.position.time!r} s"
+                self.ended = Ended(note, is_stopped=True)
 
     @contextmanager
     def _whole(self, action: str) -> Iterator[None]:
@@ -253,45 +288,42 @@ class Run:
 
     # --- changes --------------------------------------------------------------------------------
 
-    def set(self, values: Values) -> None:
-        """Set variables at the point where the run stands: an event.
+    def change(
+        self, text: str, *, values: Values = NOTHING, overrides: Overrides | None = None
+    ) -> None:
+        """Set variables, and cut inputs from their sources, where the run stands: an event.
 
         Args:
+            text: the change in words.
             values: checked, by slave and variable.
+            overrides: that hold from here on, and no others; None: they stay.
 
         Raises:
             DoublestepError: a slave refused; the run cannot go on.
         """
-        coupled, scheme = self._setup.coupled, self._setup.scheme
-        calls = [
-            ((SetValues(values[part.name]),) if part.name in values else ()) + calls
-            for part, calls in zip(coupled.parts, self._reading(), strict=True)
-        ]
         with self._whole("a change"):
-            outputs = gather(coupled, self._at_point(calls), scheme.output_rows)
-            given = {one.name: one for one in self.position.given}
+            self._change(text, values, overrides, self.position.actions)
+
+    def _change(self, text: str, values: Values, overrides: Overrides | None, actions: int) -> None:
+        position, coupled = self.position, self._setup.coupled
+        if values:
+            calls = [
+                ((SetValues(values[part.name]),) if part.name in values else ()) + calls
+                for part, calls in zip(coupled.parts, self._reading(), strict=True)
+            ]
+            outputs = gather(coupled, self._at_point(calls), self._setup.scheme.output_rows)
+            given = {one.name: one for one in position.given}
             for slave, those in values.items():
                 for name, value in those.items():
                     given[f"{slave}.{name}"] = GivenValue(f"{slave}.{name}", value)
-            self._change(
-                self.position._replace(outputs=outputs, given=tuple(given.values())),
-            )
-
-    def override(self, overrides: Overrides) -> None:
-        """Cut some connected inputs from their sources, and no others: an event.
-
-        Raises:
-            DoublestepError: a slave refused; the run cannot go on.
-        """
-        with self._whole("a change"):
+            position = position._replace(outputs=outputs, given=tuple(given.values()))
+        else:
             self._at_point(self._each())
-            self._setup.coupled.overrides.set(overrides)
-            self._change(self.position._replace(overrides=overrides))
-
-    def _change(self, position: Position) -> None:
-        """Go on behind a change at the point where the run stands."""
-        self._journal.results.cut(ReachedPoint(position.time, *position.outputs))
-        self.statistics.discontinuities += 1
+        if overrides is not None:
+            coupled.overrides.set(overrides)
+            position = position._replace(overrides=overrides)
+        position = position._replace(actions=actions)
+        self._journal.changed(position, text)
         self._checkpoints.settle()
         self._loop.move_to(self._method.behind_event(position).changed_as(position))
 

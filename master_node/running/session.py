@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from math import isfinite
 from types import TracebackType
 from typing import Any, Self
 from weakref import finalize
 
-from master_node.coupling.external import can_be_driven
-from master_node.coupling.overrides import HeldValue, Overrides
 from master_node.results import Result
 from master_node.running.run import Mark, Run
-from master_node.running.variables import ConnectedInput, Point, Variables
-from master_node.system.start_values import IGNORE_BOUNDS
+from master_node.running.variables import Point
+from master_node.system.tables import listed_values
 from protocol.errors import SteeringError
-from protocol.values import BoundsError, checked_value
-from protocol.variables import StartValue, Variable
+from protocol.variables import StartValue
 
 
 class Session:
@@ -36,7 +32,8 @@ class Session:
         self._run = run
         self._stack = stack
         self._recorded = recorded
-        self._variables = Variables(run.setup.coupled, run.setup.system)
+        self._steering = run.steering
+        self._variables = self._steering.variables
         self._is_open = True
         self._finalize = finalize(self, stack.close)
 
@@ -156,14 +153,9 @@ class Session:
             DoublestepError: a slave refused; the run cannot go on.
         """
         run = self._opened()
-        checked: dict[str, dict[str, StartValue]] = {}
-        for name, value in values.items():
-            self._variables.check(name)
-            slave, variable = self._variables.known[name]
-            self._check_settable(name, variable)
-            checked.setdefault(slave, {})[variable.name] = self._value(name, variable, value)
+        checked = self._steering.settings(values)
         if checked:
-            run.set(checked)
+            run.change(f"set {listed_values(values)}", values=checked)
 
     def override(self, values: Mapping[str, Any]) -> None:
         """Cut connected inputs from their sources and hold them at values: an event at this point.
@@ -176,13 +168,9 @@ class Session:
             DoublestepError: a slave refused; the run cannot go on.
         """
         run = self._opened()
-        overrides = run.position.overrides
-        for name, value in values.items():
-            place = self._connected(name)
-            given = self._value(name, place.variable, value)
-            overrides = _with(_without(overrides, place), place, given)
+        overrides = self._steering.overridden(run.position.overrides, values)
         if values:
-            run.override(overrides)
+            run.change(f"override {listed_values(values)}", overrides=overrides)
 
     def release(self, *names: str) -> None:
         """Let overridden inputs follow their sources again; without names all of them.
@@ -192,25 +180,15 @@ class Session:
             DoublestepError: a slave refused; the run cannot go on.
         """
         run = self._opened()
-        overrides = run.position.overrides
-        for name in names:
-            shorter = _without(overrides, self._connected(name))
-            if shorter == overrides:
-                raise SteeringError(
-                    f"{name} is not overridden", remedy="see overridden for those that are"
-                )
-            overrides = shorter
-        run.override(overrides if names else Overrides())
+        overrides = self._steering.released(run.position.overrides, names)
+        run.change(f"release {', '.join(names) or 'all'}", overrides=overrides)
 
     @property
     def overridden(self) -> dict[str, StartValue]:
         """Overridden inputs with their values, by ``slave.variable``."""
-        point, overrides = self.point, self._run.position.overrides
-        return {
-            name: point[name]
-            for name, place in self._variables.connected.items()
-            if _without(overrides, place) != overrides
-        }
+        point = self.point
+        names = self._steering.names_of(self._run.position.overrides)
+        return {name: point[name] for name in names}
 
     # --- branches -------------------------------------------------------------------------------
 
@@ -241,69 +219,3 @@ class Session:
         if not self._is_open:
             raise SteeringError("the session is closed", remedy="open another one with open_run")
         return self._run
-
-    def _connected(self, name: str) -> ConnectedInput:
-        self._variables.check(name)
-        place = self._variables.connected.get(name)
-        if place is None:
-            raise SteeringError(
-                f"{name} is no connected input: only such can be overridden",
-                remedy="use set for tunable parameters and for inputs that nothing drives",
-            )
-        return place
-
-    def _check_settable(self, name: str, variable: Variable) -> None:
-        place = self._variables.connected.get(name)
-        if place is not None:
-            raise SteeringError(
-                f"{name} is connected to {place.source}",
-                remedy="use override, which cuts it from its source",
-            )
-        if name in self._variables.external:
-            raise SteeringError(
-                f"{name} is driven from outside", remedy="leave it out of [inputs] to set it"
-            )
-        if not can_be_driven(variable):
-            kind = f"{variable.variability} {variable.causality}"
-            raise SteeringError(
-                f"{name} cannot be set during a run, as it is of the kind: {kind}",
-                remedy="only tunable parameters and inputs can; give other parameters before the "
-                f"run: [slaves.{name.partition('.')[0]}.parameters]",
-            )
-
-    def _value(self, name: str, variable: Variable, value: Any) -> StartValue:
-        """A value in the type of its variable; NumPy's numbers are as good as Python's."""
-        plain = value.item() if hasattr(value, "item") else value
-        if isinstance(plain, float) and not isfinite(plain):
-            raise SteeringError(f"{name} cannot be {plain!r}", remedy="give a finite number")
-        slave = name.partition(".")[0]
-        ignores = self._run.setup.system.slaves[slave].ignore_bounds
-        try:
-            return checked_value(variable, plain, ignores_bounds=ignores)
-        except ValueError as error:
-            remedy = IGNORE_BOUNDS if isinstance(error, BoundsError) else ""
-            raise SteeringError(f"{name} {error}", remedy=remedy) from None
-
-
-def _without(overrides: Overrides, place: ConnectedInput) -> Overrides:
-    """All but that of one input."""
-    if place.column is None:
-        held = [
-            one for one in overrides.held if (one.slave, one.input) != (place.slave, place.held)
-        ]
-        return overrides._replace(held=tuple(held))
-    pairs = zip(overrides.columns, overrides.values, strict=True)
-    kept = [(column, value) for column, value in pairs if column != place.column]
-    return overrides._replace(
-        columns=tuple(column for column, _ in kept), values=tuple(value for _, value in kept)
-    )
-
-
-def _with(overrides: Overrides, place: ConnectedInput, value: StartValue) -> Overrides:
-    """With that of one input more."""
-    if place.column is None:
-        held = (*overrides.held, HeldValue(place.slave, place.held, value))
-        return overrides._replace(held=held)
-    return overrides._replace(
-        columns=(*overrides.columns, place.column), values=(*overrides.values, float(value))
-    )

@@ -312,6 +312,7 @@ def _toml(tables: dict[str, Any]) -> str:
     parts = [{name: tables[name]} for name in ("simulation", "slaves") if tables.get(name)]
     texts = [tomli_w.dumps(part) for part in parts]
     texts += [_connection(table) for table in tables["connections"]]
+    texts += [tomli_w.dumps({"actions": [table]}) for table in tables.get("actions", ())]
     texts += [
         tomli_w.dumps({name: tables[name]})
         for name in ("inputs", "results", "bus")

@@ -53,6 +53,8 @@ def _sentence(detail: ErrorDetails, known_keys: Callable[[list[str]], list[str]]
         message = "must be a number, a boolean, a string or an array of them"
     if not place:
         return message
+    if kind == "value_error" and len(place) == 2 and place[0] in _ARRAYS:
+        return f"{_table(place)}{message}"
     if kind == "value_error" and len(place) == 1:
         return f"[{place[0]}] {message}"
     *tables, key = place
@@ -67,6 +69,9 @@ _WORDS = {
 }
 
 
+_ARRAYS = ("connections", "actions")
+"""Arrays of tables."""
+
 _SHOWN_MISTAKES = 100
 _UNION_BRANCHES = frozenset(
     {
@@ -80,7 +85,7 @@ _UNION_BRANCHES = frozenset(
 def _table(place: list[str]) -> str:
     if not place:
         return ""
-    if place[0] == "connections":
+    if place[0] in _ARRAYS:
         number = f" number {int(place[1]) + 1}" if len(place) > 1 else ""
-        return f"[[connections]]{number}: "
+        return f"[[{place[0]}]]{number}: "
     return f"[{'.'.join(place)}] "

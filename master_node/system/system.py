@@ -26,6 +26,7 @@ from master_node.system.mistakes import configuration_error
 from master_node.system.places import SspPlaces, SystemFilePlaces
 from master_node.system.simulation import PAPER, SimulationSettings
 from master_node.system.tables import (
+    Action,
     BusSettings,
     Connection,
     InputSettings,
@@ -46,6 +47,7 @@ class System(FrozenTable):
     Attributes:
         inputs: what drives inputs from outside, by ``slave.variable``; in Python also functions of
             the time, and tuples of times and values.
+        actions: what the run does by itself at points in time, in any order.
         base: directory to which the models' paths are relative; default: the working directory.
         source: what to call this in messages: the file's name.
         places: what to call its parts there.
@@ -59,6 +61,7 @@ class System(FrozenTable):
     slaves: Mapping[str, SlaveSettings]
     connections: tuple[Connection, ...] = ()
     inputs: Mapping[Reference, InputValue] = Field(default_factory=dict)
+    actions: tuple[Action, ...] = ()
     results: ResultsSettings = ResultsSettings()
     bus: BusSettings = BusSettings()
     base: Annotated[Path, AfterValidator(Path.absolute)] = Field(
@@ -166,7 +169,8 @@ class System(FrozenTable):
         return self._with(results=self.results.model_dump(exclude_unset=True) | given)
 
     def _with(self, **tables: Any) -> System:
-        kept = {"simulation", "slaves", "connections", "inputs", "results", "bus"} - tables.keys()
+        parts = {name for name, field in System.model_fields.items() if not field.exclude}
+        kept = parts - tables.keys()
         return System(
             **{name: getattr(self, name) for name in kept},
             **tables,
@@ -203,4 +207,6 @@ def _known_keys(place: list[str]) -> list[str]:
             return [field.alias or name for name, field in Connection.model_fields.items()]
         case ["inputs", _]:
             model = InputSettings
+        case ["actions", _]:
+            model = Action
     return [name for name, field in model.model_fields.items() if not field.exclude]

@@ -156,6 +156,40 @@ class Connection(FrozenTable):
         return value
 
 
+class Action(FrozenTable):
+    """An ``[[actions]]`` table: what a run does by itself at a point in time.
+
+    Attributes:
+        at: time of the action, which becomes a communication point [s].
+        set: values of tunable parameters and of inputs that nothing drives, by ``slave.variable``.
+        override: values of connected inputs, which are cut from their sources.
+        release: overridden inputs that follow their sources again.
+        stop: end the run there.
+    """
+
+    at: Number
+    set: Mapping[Reference, Value] = Field(default_factory=dict)
+    override: Mapping[Reference, Value] = Field(default_factory=dict)
+    release: tuple[Reference, ...] = ()
+    stop: StrictBool = False
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Self:
+        if not (self.set or self.override or self.release or self.stop):
+            raise ValueError("say what to do: set, override, release or stop")
+        return self
+
+    def __str__(self) -> str:
+        changes = {"set": listed_values(self.set), "release": ", ".join(self.release)}
+        changes |= {"override": listed_values(self.override), "stop": "the run" * self.stop}
+        return "; ".join(f"{verb} {what}" for verb, what in changes.items() if what)
+
+
+def listed_values(values: Mapping[str, Any]) -> str:
+    """Values of variables in words."""
+    return ", ".join(f"{name} = {value!r}" for name, value in values.items())
+
+
 class InputRows:
     """A table of an input as arrays.
 

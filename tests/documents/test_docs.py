@@ -49,6 +49,7 @@ from master_node.study.table import StudyTable
 from master_node.system.simulation import SimulationSettings
 from master_node.system.system import System, load_system
 from master_node.system.tables import (
+    Action,
     BusSettings,
     Connection,
     InputSettings,
@@ -302,7 +303,12 @@ def test_the_complete_system_file_is_the_example(tmp_path: Path) -> None:
 
 def test_the_examples_in_the_document_of_system_files_are_valid() -> None:
     """Tolerances of one output, and inputs, can be written as shown."""
-    text, inputs, _ = blocks(read("docs/system-file.md"), "toml")
+    text, actions, inputs, _ = blocks(read("docs/system-file.md"), "toml")
+    assert [a.at for a in System(slaves={"any": {}}, **tomllib.loads(actions)).actions] == [
+        1.0,
+        2.0,
+        3.0,
+    ]
     driven = System(slaves={"wheel": {}}, **tomllib.loads(inputs)).inputs
     assert driven["wheel.z"] == InputSettings(table="road.csv", column="z")
     table = tomllib.loads(text)["slaves"]["wheel"]
@@ -393,6 +399,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "## `[slaves.NAME]`": SlaveSettings,
     "## `[slaves.NAME.tolerances.OUTPUT]`": OutputTolerance,
     "## `[[connections]]`": Connection,
+    "## `[[actions]]`": Action,
     "## `[inputs]`": InputSettings,
     "## `[results]`": ResultsSettings,
     "## `[bus]`": BusSettings,
