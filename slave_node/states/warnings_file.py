@@ -32,7 +32,8 @@ class WarningsFile:
             self._size = 0
         if size == self._size:
             return NO_WARNINGS
-        data = os.pread(self._descriptor, size - self._size, self._size)
+        os.lseek(self._descriptor, self._size, os.SEEK_SET)
+        data = os.read(self._descriptor, size - self._size)
         data = data[: data.rfind(b"\n") + 1]
         self._size += len(data)
         lines = data.splitlines()
