@@ -19,7 +19,7 @@ slow: $(DEVELOPED) fmus ## the slow tests: more seeds, more cycles, more hosts
 
 SEED := $(shell git rev-parse --short=8 HEAD 2>/dev/null)
 sample: $(DEVELOPED) fmus ## some of the slow tests, others for each commit
-	$(PYTEST) -m slow --sample 5 --seed "$(SEED)"
+	$(PYTEST) -m slow --sample 2 --seed "$(SEED)"
 
 POSIX := 'slave_node/states/(fork_|channel)'
 check: $(DEVELOPED) ## linter, formatter, type checker for three platforms, import layers
